@@ -1,0 +1,24 @@
+"""DyOb-SLAM's estimator. The public names below are all that a program or notebook needs.
+
+    sequence = open_sequence("path/to/data")
+    result = run(sequence)
+
+Each name is loaded when first used, so that `import pipelines` costs nothing.
+"""
+
+from importlib import import_module
+from typing import Any
+
+_PUBLIC = {
+    "open_sequence": "pipelines.datasets",
+    "DyObSlam": "pipelines.dyob_slam",
+    "run": "pipelines.run",
+    "load_result": "pipelines.io.result",
+}
+__all__ = ["DyObSlam", "load_result", "open_sequence", "run"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        return getattr(import_module(_PUBLIC[name]), name)
+    raise AttributeError(f"module 'pipelines' has no attribute {name!r}")

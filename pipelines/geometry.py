@@ -1,0 +1,122 @@
+"""Rigid motions and the stereo pinhole model, vectorised over leading axes.
+
+Owns SE(3) algebra (right perturbation, order [omega, v]) and projection. Knows no images.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from pipelines.types import Array, StereoCamera
+
+
+def invert_T(T: Array) -> Array:
+    """Inverse of rigid motions (..., 4, 4), without a general matrix inverse."""
+    R = np.swapaxes(T[..., :3, :3], -1, -2)
+    inverse = np.zeros_like(T)
+    inverse[..., :3, :3] = R
+    inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", R, T[..., :3, 3])
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def make_T(R: Array, t: Array) -> Array:
+    """Rigid motion (4, 4) from a rotation (3, 3) and a translation (3,) in metres."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, np.ravel(t)
+    return T
+
+
+def transform_points(T: Array, points: Array) -> Array:
+    """`T` (4, 4) applied to points (N, 3)."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def skew(v: Array) -> Array:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def exp_se3(xi: Array) -> Array:
+    """Rigid motion (4, 4) of a twist (6,) [omega rad, v m]."""
+    omega, v = xi[:3], xi[3:]
+    theta = float(np.linalg.norm(omega))
+    W = skew(omega)
+    if theta < 1e-8:
+        A, B, C = 1.0, 0.5, 1.0 / 6.0
+    else:
+        A = np.sin(theta) / theta
+        B = (1.0 - np.cos(theta)) / theta**2
+        C = (1.0 - A) / theta**2
+    W2 = W @ W
+    return make_T(np.eye(3) + A * W + B * W2, (np.eye(3) + B * W + C * W2) @ v)
+
+
+def orthonormalise(T: Array) -> Array:
+    """`T` with its rotation replaced by the nearest true rotation (drift of long products)."""
+    U, _, Vt = np.linalg.svd(T[..., :3, :3])
+    out = T.copy()
+    out[..., :3, :3] = U @ Vt
+    return out
+
+
+def rotation_angle_deg(T: Array) -> Array:
+    """Angle of the rotation part of motions (..., 4, 4), in degrees, exact for small angles."""
+    R = T[..., :3, :3]
+    w = np.stack(
+        [
+            R[..., 2, 1] - R[..., 1, 2],
+            R[..., 0, 2] - R[..., 2, 0],
+            R[..., 1, 0] - R[..., 0, 1],
+        ],
+        -1,
+    )
+    trace = np.trace(R, axis1=-2, axis2=-1)
+    return np.degrees(np.arctan2(np.linalg.norm(w, axis=-1), trace - 1.0))
+
+
+def q_xyzw_from_T(T: Array) -> Array:
+    """Unit quaternions (..., 4), order x y z w, of motions (..., 4, 4)."""
+    flat = T[..., :3, :3].reshape(-1, 3, 3)
+    return Rotation.from_matrix(flat).as_quat().reshape(*T.shape[:-2], 4)
+
+
+def T_from_q_xyzw(t: Array, q_xyzw: Array) -> Array:
+    """Motions (..., 4, 4) from translations (..., 3) in metres and quaternions (..., 4)."""
+    T = np.zeros((*np.shape(t)[:-1], 4, 4))
+    flat = Rotation.from_quat(np.reshape(q_xyzw, (-1, 4))).as_matrix()
+    T[..., :3, :3] = flat.reshape(*np.shape(t)[:-1], 3, 3)
+    T[..., :3, 3] = t
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def project_stereo(camera: StereoCamera, points_camera: Array) -> Array:
+    """Stereo pixels (N, 3) [u_L, v, u_R] of points (N, 3) in the camera; z must be positive."""
+    x, y, z = points_camera.T
+    u = camera.fx * x / z + camera.cx
+    return np.stack([u, camera.fy * y / z + camera.cy, u - camera.bf / z], -1)
+
+
+def backproject(camera: StereoCamera, uv_px: Array, depth_m: Array) -> Array:
+    """Points (N, 3) in the camera of pixels (N, 2) at depths (N,) in metres."""
+    x = (uv_px[:, 0] - camera.cx) / camera.fx * depth_m
+    y = (uv_px[:, 1] - camera.cy) / camera.fy * depth_m
+    return np.stack([x, y, depth_m], -1)
+
+
+def inside_image(camera: StereoCamera, uv_px: Array, border_px: float = 0.0) -> NDArray[np.bool_]:
+    """Which pixels (N, 2) lie in the image, at least `border_px` from its edges."""
+    u, v = uv_px[:, 0], uv_px[:, 1]
+    return (
+        (u >= border_px)
+        & (v >= border_px)
+        & (u <= camera.width - 1 - border_px)
+        & (v <= camera.height - 1 - border_px)
+    )

@@ -1,0 +1,260 @@
+"""The nouns that the steps of the system hand to each other: frozen bundles of numpy arrays.
+
+Owns shapes, units and frames of the data. Imports numpy alone, and knows no algorithm.
+
+Conventions: `T_world_camera` is 4x4 float64 with `p_world = T_world_camera @ p_camera`; camera axes
+are OpenCV's (x right, y down, z forward); the world is the first camera; pixels are (u, v) with the
+centre of the top left pixel at (0, 0).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+
+def _check_shape(owner: str, name: str, array: NDArray, expected: tuple[int | None, ...]) -> None:
+    """Raise ValueError unless `array` has `expected` shape; None stands for any size."""
+    ok = array.ndim == len(expected) and all(
+        want is None or have == want for have, want in zip(array.shape, expected, strict=True)
+    )
+    if not ok:
+        wanted = ", ".join("any" if n is None else str(n) for n in expected)
+        raise ValueError(f"{owner}.{name}: expected shape ({wanted}), found {array.shape}")
+
+
+@dataclass(frozen=True, slots=True)
+class StereoCamera:
+    """A rectified pinhole pair, or an RGB-D camera with a virtual right one.
+
+    `bf` is baseline times fx in px * m, so that disparity [px] = bf / depth [m].
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    bf: float
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.height, self.fx, self.fy, self.bf) <= 0:
+            raise ValueError(f"StereoCamera: expected positive size, focal lengths and bf: {self}")
+
+    @property
+    def baseline_m(self) -> float:
+        return self.bf / self.fx
+
+    @property
+    def K(self) -> Array:
+        """(3, 3) float64 intrinsic matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """What the estimator gets of one moment. There is no ground truth in it, by design.
+
+    image: (H, W) grey or (H, W, 3) RGB, uint8.
+    image_right: the rectified right image in the same form, or None.
+    depth_m: (H, W) float32, registered to `image`, NaN where unknown, or None.
+    flow_prev_to_curr_px: (H, W, 2) float32 (du, dv) on the pixel grid of the *previous* frame of
+        this sequence, pointing into this one; NaN where unknown, or None.
+    instance_labels: (H, W) int32, 0 = background, > 0 = instances of movable classes as they come
+        with the sequence; labels need not be the same from frame to frame. None if there are none.
+    """
+
+    index: int
+    timestamp_s: float
+    image: Image
+    image_right: Image | None = None
+    depth_m: NDArray[np.float32] | None = None
+    flow_prev_to_curr_px: NDArray[np.float32] | None = None
+    instance_labels: NDArray[np.int32] | None = None
+
+    def __post_init__(self) -> None:
+        if self.image.ndim not in (2, 3) or self.image.dtype != np.uint8:
+            raise ValueError(
+                "Frame.image: expected (H, W) or (H, W, 3) uint8, "
+                f"found {self.image.shape} {self.image.dtype}"
+            )
+        H, W = self.image.shape[:2]
+        if self.image_right is not None:
+            _check_shape("Frame", "image_right", self.image_right, self.image.shape)
+        if self.depth_m is not None:
+            _check_shape("Frame", "depth_m", self.depth_m, (H, W))
+        if self.flow_prev_to_curr_px is not None:
+            _check_shape("Frame", "flow_prev_to_curr_px", self.flow_prev_to_curr_px, (H, W, 2))
+        if self.instance_labels is not None:
+            _check_shape("Frame", "instance_labels", self.instance_labels, (H, W))
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectTruth:
+    """True object states, one row per object and frame (parallel arrays of length M).
+
+    frame_index, object_id: (M,) int64. class_name: (M,) str. Ts_world_object: (M, 4, 4).
+    boxes_px: (M, 4) float64 x1 y1 x2 y2 of the visible part, NaN where out of sight.
+    moving: (M,) bool, whether the object ever moves in the sequence.
+    """
+
+    frame_index: NDArray[np.int64]
+    object_id: NDArray[np.int64]
+    class_name: NDArray[np.str_]
+    Ts_world_object: Array
+    boxes_px: Array
+    moving: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        M = len(self.frame_index)
+        for name in ("frame_index", "object_id", "class_name", "moving"):
+            _check_shape("ObjectTruth", name, getattr(self, name), (M,))
+        _check_shape("ObjectTruth", "Ts_world_object", self.Ts_world_object, (M, 4, 4))
+        _check_shape("ObjectTruth", "boxes_px", self.boxes_px, (M, 4))
+
+    def __len__(self) -> int:
+        return len(self.frame_index)
+
+
+@dataclass(frozen=True, slots=True)
+class GroundTruth:
+    """What the evaluator alone may see.
+
+    timestamps_s: (N,) of the frames. Ts_world_camera: (N, 4, 4), NaN where unknown, in any world
+    frame (the evaluator aligns). objects: true object states, or None.
+    """
+
+    timestamps_s: Array
+    Ts_world_camera: Array
+    objects: ObjectTruth | None = None
+
+    def __post_init__(self) -> None:
+        N = len(self.timestamps_s)
+        _check_shape("GroundTruth", "timestamps_s", self.timestamps_s, (N,))
+        _check_shape("GroundTruth", "Ts_world_camera", self.Ts_world_camera, (N, 4, 4))
+
+
+class TrackingStatus(StrEnum):
+    """Whether the pose of a frame was measured (OK) or only predicted (LOST)."""
+
+    OK = "OK"
+    LOST = "LOST"
+
+
+class MotionHypothesis(StrEnum):
+    """Where the initial camera pose of a frame came from."""
+
+    FIRST_FRAME = "first_frame"
+    CONSTANT_VELOCITY = "constant_velocity"
+    PNP_RANSAC = "pnp_ransac"
+    RGBD_ODOMETRY = "rgbd_odometry"
+    RELOCALISATION = "relocalisation"
+    NONE = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """ORB features of one image (parallel arrays of length N).
+
+    uv_px: (N, 2) float64. octave: (N,) int32. angle_deg: (N,) float32. response: (N,) float32.
+    descriptors: (N, 32) uint8. depth_m: (N,) float64, NaN where unknown.
+    """
+
+    uv_px: Array
+    octave: NDArray[np.int32]
+    angle_deg: NDArray[np.float32]
+    response: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    depth_m: Array
+
+    def __post_init__(self) -> None:
+        N = len(self.uv_px)
+        _check_shape("Features", "uv_px", self.uv_px, (N, 2))
+        for name in ("octave", "angle_deg", "response", "depth_m"):
+            _check_shape("Features", name, getattr(self, name), (N,))
+        _check_shape("Features", "descriptors", self.descriptors, (N, 32))
+
+    def __len__(self) -> int:
+        return len(self.uv_px)
+
+    def __getitem__(self, which: NDArray) -> Features:
+        """The features chosen by a boolean mask or an index array."""
+        return Features(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    @classmethod
+    def empty(cls) -> Features:
+        return cls(
+            np.empty((0, 2)),
+            np.empty(0, np.int32),
+            np.empty(0, np.float32),
+            np.empty(0, np.float32),
+            np.empty((0, 32), np.uint8),
+            np.empty(0),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """What the estimator says of one frame.
+
+    T_world_camera: (4, 4); measured when status is OK, predicted when LOST.
+    pose_covariance: (6, 6) of the right perturbation [omega (rad), v (m)], NaN when LOST.
+    keypoints_px: (N, 2) static keypoints that the pose was measured with, and candidates.
+    point_ids: (N,) int64, the map point each keypoint observes, -1 where it observes none.
+    inliers: (N,) bool, whether the observation agreed with the pose.
+    timings_ms: wall time of each stage of this frame, plus "total".
+    """
+
+    frame_index: int
+    timestamp_s: float
+    status: TrackingStatus
+    T_world_camera: Array
+    pose_covariance: Array
+    hypothesis: MotionHypothesis
+    is_keyframe: bool
+    keypoints_px: Array
+    point_ids: NDArray[np.int64]
+    inliers: NDArray[np.bool_]
+    reprojection_rmse_px: float
+    timings_ms: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        N = len(self.keypoints_px)
+        _check_shape("FrameResult", "T_world_camera", self.T_world_camera, (4, 4))
+        _check_shape("FrameResult", "keypoints_px", self.keypoints_px, (N, 2))
+        _check_shape("FrameResult", "point_ids", self.point_ids, (N,))
+        _check_shape("FrameResult", "inliers", self.inliers, (N,))
+
+
+@dataclass(frozen=True, slots=True)
+class StaticMap:
+    """The sparse static map as the outside sees it (parallel arrays of length N).
+
+    points_m: (N, 3) in the world. colors: (N, 3) uint8 RGB. n_observations: (N,) int32.
+    keyframe_Ts_world_camera: (K, 4, 4). keyframe_indices: (K,) int64 frame indices.
+    """
+
+    points_m: Array
+    colors: NDArray[np.uint8]
+    n_observations: NDArray[np.int32]
+    keyframe_Ts_world_camera: Array
+    keyframe_indices: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        N, K = len(self.points_m), len(self.keyframe_indices)
+        _check_shape("StaticMap", "points_m", self.points_m, (N, 3))
+        _check_shape("StaticMap", "colors", self.colors, (N, 3))
+        _check_shape("StaticMap", "n_observations", self.n_observations, (N,))
+        _check_shape(
+            "StaticMap", "keyframe_Ts_world_camera", self.keyframe_Ts_world_camera, (K, 4, 4)
+        )
+
+    def __len__(self) -> int:
+        return len(self.points_m)
