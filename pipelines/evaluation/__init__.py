@@ -1,0 +1,11 @@
+"""Errors and costs of a run, from the files of its result folder alone.
+
+Owns the "camera" block of metrics.json and the table made of it. Nothing here runs beside the
+estimator, and the estimator imports nothing from here.
+"""
+
+from pipelines.evaluation.camera import evaluate_camera
+from pipelines.evaluation.folder import evaluate_result
+from pipelines.evaluation.table import metrics_table, metrics_text
+
+__all__ = ["evaluate_camera", "evaluate_result", "metrics_table", "metrics_text"]

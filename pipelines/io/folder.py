@@ -1,0 +1,102 @@
+"""Where results lie: one new folder a run, and the `latest` link beside them.
+
+Owns every file name of a result folder. Knows no content.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+import uuid
+from pathlib import Path
+
+from pipelines.errors import DyObError, FormatError
+
+CONFIG = "config.yaml"
+LOG = "run.log"
+CAMERA_TUM = "camera_tum.txt"
+CAMERA_KITTI = "camera_kitti.txt"
+CAMERA_GT_TUM = "camera_gt_tum.txt"
+STATIC_MAP = "static_map.ply"
+METRICS_JSON = "metrics.json"
+METRICS_TXT = "metrics.txt"
+TIMINGS = "timings.json"
+FRAMES = "frames"
+PLOTS = "plots"
+RENDERS = "renders"
+LATEST = "latest"
+
+logger = logging.getLogger("dyob.io")
+
+
+def create_result_folder(root: Path | str, name: str) -> Path:
+    """Make `root/<YYYYmmdd-HHMMSS>-<name>`, never one that exists, and point `root/latest` to it.
+
+    Characters of `name` that a path should not hold become "_". Raises DyObError where the disk
+    refuses; a `latest` that cannot be made is a warning only.
+    """
+    root = Path(root)
+    safe = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "run"
+    base = f"{time.strftime('%Y%m%d-%H%M%S')}-{safe}"
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        folder = _first_free(root, base)
+    except OSError as error:
+        raise DyObError(
+            f"{root}: expected a folder to put results in, found '{error.strerror}'; "
+            "choose another --output"
+        ) from error
+    _point_latest(root, folder.name)
+    return folder
+
+
+def _first_free(root: Path, base: str) -> Path:
+    number = 1
+    while True:
+        folder = root / (base if number == 1 else f"{base}-{number}")
+        try:
+            folder.mkdir()
+            return folder
+        except FileExistsError:
+            number += 1
+
+
+def _point_latest(root: Path, target: str) -> None:
+    """Replace the link in one step, so that a reader never finds it missing."""
+    fresh = root / f".{LATEST}.{uuid.uuid4().hex[:8]}"
+    try:
+        fresh.symlink_to(target, target_is_directory=True)
+        fresh.replace(root / LATEST)
+    except OSError as error:
+        fresh.unlink(missing_ok=True)
+        logger.warning(
+            "%s could not be pointed to the new results (%s)", root / LATEST, error.strerror
+        )
+
+
+def open_result_folder(path: Path | str) -> Path:
+    """The real folder behind `path` (a result folder or the `latest` link), checked to be one.
+
+    Raises FormatError that says what was expected, what was found and what to do.
+    """
+    path = Path(path)
+    if path.is_symlink() and not path.exists():
+        raise FormatError(
+            f"{path}: expected a link to a result folder, found that its target is gone; "
+            "run a sequence again or name another folder"
+        )
+    if not path.is_dir():
+        found = "a file" if path.exists() else "nothing"
+        raise FormatError(
+            f"{path}: expected a result folder, found {found}; "
+            "name a folder that 'python -m app run' has written, such as results/latest"
+        )
+    if not (path / CAMERA_TUM).is_file():
+        hint = "run a sequence first"
+        if (path / LATEST / CAMERA_TUM).is_file():
+            hint = f"did you mean {path / LATEST}?"
+        raise FormatError(
+            f"{path}: expected a result folder with {CAMERA_TUM}, found no such file in it; {hint}"
+        )
+    return path.resolve()

@@ -1,0 +1,112 @@
+"""Evaluation of result folders, from their files alone."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pipelines.errors import FormatError
+from pipelines.evaluation import evaluate_result, metrics_table
+from pipelines.geometry import exp_se3
+from pipelines.io.result import ResultWriter, run_metrics
+from pipelines.types import (
+    FrameResult,
+    GroundTruth,
+    MotionHypothesis,
+    StaticMap,
+    TrackingStatus,
+)
+
+STEP = exp_se3(np.array([0.0, 0.01, 0.0, 0.0, 0.0, 1.0]))
+NO_MAP = StaticMap(
+    np.empty((0, 3)),
+    np.empty((0, 3), np.uint8),
+    np.empty(0, np.int32),
+    np.empty((0, 4, 4)),
+    np.empty(0, np.int64),
+)
+
+
+def truth(n: int) -> GroundTruth:
+    Ts = np.array([np.linalg.matrix_power(STEP, k) for k in range(n)])
+    return GroundTruth(np.arange(n) * 0.1, Ts)
+
+
+def results(n: int, jump_at: int, left_out: tuple[int, ...] = ()) -> list[FrameResult]:
+    """Exact poses with a jump of 1 m before frame `jump_at`; frames left out were unreadable."""
+    out = []
+    for k in range(n):
+        T = np.linalg.matrix_power(STEP, k)
+        T[1, 3] += float(k >= jump_at)
+        out.append(
+            FrameResult(
+                frame_index=k,
+                timestamp_s=0.1 * k,
+                status=TrackingStatus.OK,
+                T_world_camera=T,
+                pose_covariance=np.eye(6),
+                hypothesis=MotionHypothesis.CONSTANT_VELOCITY,
+                is_keyframe=False,
+                keypoints_px=np.empty((0, 2)),
+                point_ids=np.empty(0, np.int64),
+                inliers=np.empty(0, bool),
+                reprojection_rmse_px=0.0,
+                timings_ms={"total": 20.0},
+            )
+        )
+    return [r for r in out if r.frame_index not in left_out]
+
+
+def write(folder, frames, gt) -> ResultWriter:
+    writer = ResultWriter(folder)
+    writer.write_run(frames, NO_MAP, gt)
+    run = run_metrics(frames, NO_MAP, sequence="s", dataset="vdo")
+    writer.write_metrics({"run": run, "extra": {"a": 1}}, "")
+    return writer
+
+
+def test_camera_block_is_renewed_and_others_stay(tmp_path):
+    write(tmp_path, results(20, jump_at=8), truth(20))
+    metrics = evaluate_result(tmp_path)
+    assert metrics["camera"]["rpe_pairs"] == 19
+    assert metrics["camera"]["rpe_trans_max_m"] == pytest.approx(1.0, abs=1e-6)
+    assert metrics["run"]["sequence"] == "s"
+    assert metrics["extra"] == {"a": 1}
+    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
+    text = (tmp_path / "metrics.txt").read_text()
+    assert f"{metrics['camera']['rpe_trans_rmse_m']:.5f}  m/frame" in text
+    assert "20.0  ms" in text
+    assert evaluate_result(tmp_path) == metrics
+
+
+def test_a_pair_over_a_skipped_frame_does_not_count(tmp_path):
+    write(tmp_path, results(20, jump_at=8, left_out=(7, 8)), truth(20))
+    metrics = evaluate_result(tmp_path)
+    assert metrics["camera"]["frames_matched"] == 18
+    assert metrics["camera"]["rpe_pairs"] == 16
+    assert metrics["camera"]["rpe_trans_max_m"] < 1e-6
+
+
+def test_a_pair_over_unknown_truth_does_not_count(tmp_path):
+    gt = truth(20)
+    gt.Ts_world_camera[[7, 8]] = np.nan
+    write(tmp_path, results(20, jump_at=8), gt)
+    metrics = evaluate_result(tmp_path)
+    assert metrics["camera"]["rpe_pairs"] == 16
+    assert metrics["camera"]["rpe_trans_max_m"] < 1e-6
+
+
+def test_no_truth_no_camera_block(tmp_path):
+    write(tmp_path, results(5, jump_at=9), None)
+    assert "camera" not in evaluate_result(tmp_path)
+    assert "No ground truth" in (tmp_path / "metrics.txt").read_text()
+
+
+def test_no_folder(tmp_path):
+    with pytest.raises(FormatError, match="expected a result folder"):
+        evaluate_result(tmp_path / "gone")
+
+
+def test_table_has_only_what_there_is():
+    rows = metrics_table({"run": {"frames": 3}, "camera": {"ate_rmse_m": 0.5, "ate_max_m": None}})
+    assert [(value, unit) for _, value, unit in rows] == [("3", ""), ("0.5000", "m")]
