@@ -1,0 +1,121 @@
+"""Camera settings of a sequence: small YAML files, matrices of text, and what follows from them.
+
+Owns reading `key: value` settings (plain YAML and OpenCV's `%YAML:1.0` alike) and making a
+StereoCamera of them. Knows no layout.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.datasets.files import Size
+from pipelines.errors import DatasetError
+from pipelines.types import StereoCamera
+
+RGBD_BF = 40.0  # px * m, virtual right camera of an RGB-D one: 7.5 cm behind 530 px, as ORB-SLAM2
+Settings = Mapping[str, str]
+CAMERA_KEYS = (
+    *("fx", "fy", "cx", "cy", "width", "height", "bf", "baseline_m"),
+    *("fps", "depth_scale", "depth_form"),
+)
+CAMERA_YAML = (
+    "camera.yaml with one `key: value` a line: fx, fy, cx, cy in pixels; bf (px * m) or "
+    "baseline_m; fps unless there is a times.txt; depth_scale, the value of 1 m in depth images; "
+    "width and height if you like"
+)
+
+
+def read_settings(path: Path) -> dict[str, str]:
+    """Flat `key: value` lines of a settings file as text, comments and nested blocks left out."""
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError as error:
+        raise DatasetError(f"Settings {path} cannot be read ({error.strerror}).") from error
+    settings = {}
+    for line in lines:
+        content = line.split("#", 1)[0].rstrip()
+        if content.startswith(("%", "-", " ", "\t")) or ":" not in content:
+            continue
+        key, value = content.split(":", 1)
+        settings[key.strip()] = value.strip().strip("\"'")
+    return settings
+
+
+def number(settings: Settings, key: str, source: Path) -> float | None:
+    """The value of `key` as a finite number, None where it is not set."""
+    if key not in settings:
+        return None
+    try:
+        value = float(settings[key])
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise DatasetError(
+            f"{source}: expected a number for `{key}`, found {settings[key]!r}; correct it."
+        )
+    return value
+
+
+def required(settings: Settings, keys: Iterable[str], source: Path) -> list[float]:
+    """The numbers of all `keys`; raises DatasetError that names those missing."""
+    values = {key: number(settings, key, source) for key in keys}
+    missing = [key for key, value in values.items() if value is None]
+    if missing:
+        raise DatasetError(
+            f"{source}: missing calibration, expected {', '.join(values)}, "
+            f"found no {', '.join(missing)}; add {'it' if len(missing) == 1 else 'them'}."
+        )
+    return [value for value in values.values() if value is not None]
+
+
+def settings_size(settings: Settings, source: Path, prefix: str = "") -> Size | None:
+    """Width and height that the settings state, or None where they state none."""
+    width, height = (number(settings, prefix + key, source) for key in ("width", "height"))
+    return None if width is None or height is None else (int(width), int(height))
+
+
+def make_camera(size: Size, fx: float, fy: float, cx: float, cy: float, bf: float, source: Path):
+    """A StereoCamera; raises DatasetError where the numbers cannot be a camera's."""
+    width, height = size
+    if min(fx, fy, bf) <= 0 or not (0 < cx < width and 0 < cy < height):
+        raise DatasetError(
+            f"{source}: expected positive fx, fy and bf and a principal point inside the image of "
+            f"{width} x {height}, found fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}, bf {bf:g}; "
+            "correct the calibration."
+        )
+    return StereoCamera(width, height, *(float(value) for value in (fx, fy, cx, cy, bf)))
+
+
+def read_camera_yaml(path: Path) -> dict[str, str]:
+    """Settings of this project's own camera.yaml; an unknown key is an error."""
+    settings = read_settings(path)
+    for key in settings:
+        if key not in CAMERA_KEYS:
+            nearest = difflib.get_close_matches(key, CAMERA_KEYS, 1)
+            hint = (
+                f"did you mean `{nearest[0]}`?" if nearest else f"known: {', '.join(CAMERA_KEYS)}"
+            )
+            raise DatasetError(f"{path}: unknown key `{key}`; {hint}")
+    return settings
+
+
+def bf_of(settings: Settings, source: Path) -> float | None:
+    """bf in px * m from `bf`, or `baseline_m` times fx; None where neither is set."""
+    bf, baseline_m = number(settings, "bf", source), number(settings, "baseline_m", source)
+    if bf is None and baseline_m is not None:
+        bf = baseline_m * required(settings, ["fx"], source)[0]
+    return bf
+
+
+def read_matrix(path: Path) -> np.ndarray:
+    """A matrix of numbers from text; raises DatasetError where it is none."""
+    try:
+        return np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise DatasetError(
+            f"{path}: expected rows of numbers, found other text ({error})."
+        ) from error

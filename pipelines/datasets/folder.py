@@ -1,0 +1,134 @@
+"""Own data: a folder of images with depth or right images, and a camera.yaml.
+
+Owns this layout. Decoding is in `files`, the yaml's keys in `calibration`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Self
+
+from pipelines.datasets.calibration import (
+    CAMERA_YAML,
+    RGBD_BF,
+    bf_of,
+    make_camera,
+    number,
+    read_camera_yaml,
+    required,
+    settings_size,
+)
+from pipelines.datasets.file_sequence import FileSequence, FrameFiles, common_image_size
+from pipelines.datasets.files import DepthCoding
+from pipelines.datasets.timestamps import frame_times
+from pipelines.datasets.tree import first_folder, list_files, tree_error
+from pipelines.datasets.truth import read_tum_poses
+from pipelines.errors import DatasetError
+from pipelines.types import GroundTruth
+
+IMAGE_FOLDERS = ("images", "left", "image", "rgb", "color")
+DEPTH_SUFFIXES = (".png", ".npy")
+FLOW_SUFFIXES = (".flo", ".npy")
+MASK_SUFFIXES = (".png", ".npy", ".txt")
+LISTS = ("associations.txt", "associate.txt", "rgb.txt")  # of tum_rgbd
+
+
+class FolderSequence(FileSequence):
+    """Images in order of their numbers, with files of the same stem for everything else."""
+
+    dataset = "folder"
+    layout = (
+        "images/ (or left/, image/, rgb/, color/), depth/ (16-bit PNG or .npy in metres) or "
+        "right/, camera.yaml; optional times.txt, flow/ (.flo or .npy, k to k + 1), masks/ "
+        "(.png, .npy or .txt of labels), groundtruth.txt (TUM)"
+    )
+
+    @classmethod
+    def matches(cls, path: Path) -> bool:
+        if first_folder(path, IMAGE_FOLDERS) is None:
+            return False
+        if any((path / name).is_file() for name in LISTS):
+            return False
+        others = (path / "camera.yaml", path / "depth", path / "right")
+        marks = (path / "semantic", path / "object_pose.txt", path / "pose_gt.txt")
+        foreign = any(mark.exists() for mark in marks) or any(path.glob("*.y*ml"))
+        return others[0].is_file() or (any(o.is_dir() for o in others[1:]) and not foreign)
+
+    @classmethod
+    def _open(cls, root: Path, depth_scale: float | None = None, fps: float | None = None) -> Self:
+        """The sequence in `root`; options override camera.yaml."""
+        folder = first_folder(root, IMAGE_FOLDERS)
+        images = list_files(folder) if folder else {}
+        if not images:
+            raise tree_error(cls.dataset, cls.layout, root, "no images", "Put the images there.")
+        yaml = root / "camera.yaml"
+        if not yaml.is_file():
+            advice = f"Add {CAMERA_YAML}."
+            raise tree_error(cls.dataset, cls.layout, root, "missing calibration", advice)
+        depths = list_files(root / "depth", DEPTH_SUFFIXES)
+        rights = {} if depths else list_files(root / "right")
+        if not depths and not rights:
+            advice = "Add one of them: one camera alone has no scale."
+            raise tree_error(cls.dataset, cls.layout, root, "no depth and no right images", advice)
+        settings = read_camera_yaml(yaml)
+        fx, fy, cx, cy = required(settings, ("fx", "fy", "cx", "cy"), yaml)
+        bf = bf_of(settings, yaml)
+        if bf is None and rights:
+            raise DatasetError(
+                f"{yaml}: missing calibration, expected bf (px * m) or baseline_m of the stereo "
+                "pair, found neither; add one."
+            )
+        size = common_image_size(list(images.values()), settings_size(settings, yaml), str(yaml))
+        camera = make_camera(size, fx, fy, cx, cy, bf or RGBD_BF, yaml)
+        fps = fps or number(settings, "fps", yaml)
+        times_s = frame_times(root / "times.txt", fps, len(images), root)
+        scale = depth_scale or number(settings, "depth_scale", yaml)
+        coding = _coding(depths, scale, settings.get("depth_form", "metric"), camera.bf, yaml)
+        return cls(root, camera, times_s, _frame_files(root, images, depths, rights), coding)
+
+    def ground_truth(self) -> GroundTruth | None:
+        path = self.root / "groundtruth.txt"
+        if not path.is_file():
+            return None
+        return GroundTruth(self.timestamps_s, read_tum_poses(path, self.timestamps_s))
+
+
+def _coding(
+    depths: dict[str, Path], scale: float | None, form: str, bf: float, yaml: Path
+) -> DepthCoding | None:
+    if not depths:
+        return None
+    if scale is None:
+        if any(path.suffix.lower() == ".png" for path in depths.values()):
+            raise DatasetError(
+                f"{yaml}: missing calibration, expected depth_scale, the value of 1 m in the depth "
+                "images (1000 for millimetres), found none; add it."
+            )
+        scale = 1.0
+    return DepthCoding(form, scale, bf)  # type: ignore[arg-type]  # checks the form itself
+
+
+def _frame_files(
+    root: Path, images: dict[str, Path], depths: dict[str, Path], rights: dict[str, Path]
+) -> list[FrameFiles]:
+    """Files by stem; one that is absent from a kind that others have gets a path all the same."""
+    flows = list_files(root / "flow", FLOW_SUFFIXES)
+    masks = list_files(root / "masks", MASK_SUFFIXES)
+    stems = list(images)
+
+    def file_of(found: dict[str, Path], stem: str) -> Path | None:
+        if not found:
+            return None
+        example = next(iter(found.values()))
+        return found.get(stem, example.with_name(stem + example.suffix))
+
+    return [
+        FrameFiles(
+            image=images[stem],
+            image_right=file_of(rights, stem),
+            depth=file_of(depths, stem),
+            flow_prev_to_curr=file_of(flows, stems[k - 1]) if k > 0 else None,
+            labels=file_of(masks, stem),
+        )
+        for k, stem in enumerate(stems)
+    ]
