@@ -1,0 +1,258 @@
+"""The command line's words: verbs, flags and examples, and which function runs each verb.
+
+Owns the parser. Standard library only, so that help comes at once and before any set-up; the
+functions behind the verbs are imported when called.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+
+from app import bootstrap
+from app.environment import CORE, DEVELOPMENT
+
+PROGRAM = "python3 -m app"
+LATEST = "results/latest"
+
+
+@dataclass(frozen=True)
+class Verb:
+    """One word of the command line: the function it runs, and what must be installed for it."""
+
+    function: str
+    summary: str
+    examples: str
+    sections: tuple[str, ...] = (CORE,)
+
+
+VERBS = {
+    "demo": Verb(
+        "app.runs:demo",
+        "run a small simulated sequence from start to pictures",
+        "demo                            # needs nothing but Python: sets itself up",
+    ),
+    "run": Verb(
+        "app.runs:run",
+        "run a sequence and write a result folder",
+        """\
+run DATA                        # the layout is guessed from the folder
+run DATA --dataset tum_rgbd --frames 100 --stride 2
+run simulated:street --degrade --seed 7
+run DATA --set orb.n_features=1500 --output my_results""",
+    ),
+    "eval": Verb(
+        "app.runs:evaluate",
+        "compute a result folder's errors anew from its files",
+        """\
+eval                            # the latest result
+eval RESULT""",
+    ),
+    "render": Verb(
+        "app.runs:render",
+        "draw a result folder's map and trajectory, without a display",
+        """\
+render                          # the latest result
+render RESULT --size 1920x1080 --views top""",
+    ),
+    "doctor": Verb(
+        "app.doctor:doctor",
+        "say whether this machine, or a data folder, is fit",
+        """\
+doctor                          # this machine
+doctor DATA                     # and a data folder""",
+        (),
+    ),
+    "config": Verb(
+        "app.listings:config",
+        "print every setting with its value, unit and meaning",
+        """\
+config > my.yaml                # edit it, then: run DATA --config my.yaml
+config --set orb.n_features=1500""",
+    ),
+    "datasets": Verb(
+        "app.listings:datasets",
+        "list the data layouts that can be read",
+        """\
+datasets                        # names and expected files
+datasets vdo""",
+    ),
+    "test": Verb(
+        "app.checks:test",
+        "run the linters, the type checker and the tests",
+        """\
+test                            # everything
+test -k config -x               # pytest's flags""",
+        (CORE, DEVELOPMENT),
+    ),
+}
+
+_FIRST_EXAMPLES = """\
+demo                            # sets itself up, runs, draws, tells what to do next
+run DATA                        # your own stereo or RGB-D sequence
+render                          # pictures of the latest result
+doctor DATA                     # what is missing, in words
+VERB --help                     # more examples"""
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose help begins with examples, and whose errors are one sentence."""
+
+    examples = ""
+
+    def format_help(self) -> str:
+        lines = "\n".join(f"  {PROGRAM} {line}" for line in self.examples.splitlines())
+        return f"Examples:\n{lines}\n\n{super().format_help()}"
+
+    def error(self, message: str) -> None:  # type: ignore[override]
+        self.exit(2, f"dyob-slam: {message}; see '{self.prog} --help'\n")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Parse, make sure that the verb's packages are there, run it; the exit code."""
+    parser = build_parser()
+    arguments, extra = parser.parse_known_args(argv)
+    if arguments.verb is None:
+        sys.stdout.write(parser.format_help())
+        return 0
+    if arguments.verb == "test":
+        arguments.pytest_arguments += extra
+    elif extra:
+        parser.error(f"'{arguments.verb}' does not know {' '.join(extra)}")
+    verb = VERBS[arguments.verb]
+    if verb.sections:
+        bootstrap.prepare(argv, verb.sections)
+    else:
+        bootstrap.enter_if_ready(argv)
+    module, _, function = verb.function.partition(":")
+    return int(getattr(import_module(module), function)(arguments))
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line; parsing it imports nothing beyond the standard library."""
+    parser = _Parser(
+        prog=PROGRAM,
+        description="DyOb-SLAM: camera trajectory and static map from stereo or RGB-D sequences "
+        "in which things move.",
+        allow_abbrev=False,
+    )
+    parser.examples = _FIRST_EXAMPLES
+    parser.set_defaults(verb=None)
+    verbs = parser.add_subparsers(dest="verb", metavar="VERB", title="verbs")
+    adders = {
+        "demo": _add_demo,
+        "run": _add_run,
+        "eval": _add_result,
+        "render": _add_render,
+        "doctor": _add_doctor,
+        "config": _add_settings,
+        "datasets": _add_datasets,
+        "test": _add_test,
+    }
+    for name, verb in VERBS.items():
+        sub = verbs.add_parser(
+            name,
+            help=verb.summary,
+            description=f"{verb.summary[0].upper()}{verb.summary[1:]}.",
+            allow_abbrev=False,
+        )
+        sub.examples = verb.examples
+        sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        adders[name](sub)
+    return parser
+
+
+def _add_demo(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--frames", type=_positive, metavar="N", help="stop after N frames")
+    _add_output(parser)
+
+
+def _add_run(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "path", metavar="PATH", help="data folder, or simulated:NAME such as simulated:street"
+    )
+    parser.add_argument("--dataset", metavar="NAME", help="layout, where the guess is wrong")
+    parser.add_argument("--sequence", metavar="NAME", help="which sequence, where PATH holds many")
+    parser.add_argument("--start", type=_not_negative, default=0, metavar="K", help="first frame")
+    parser.add_argument("--frames", type=_positive, metavar="N", help="stop after N frames")
+    parser.add_argument("--stride", type=_positive, default=1, metavar="S", help="every S-th frame")
+    parser.add_argument("--seed", type=_not_negative, metavar="N", help="of all random choices")
+    parser.add_argument(
+        "--degrade", action="store_true", help="simulated sequences: noisy, worn inputs"
+    )
+    _add_settings(parser)
+    _add_output(parser)
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--output", metavar="DIR", help="where results go (default: results/)")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar and no tables")
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--config", metavar="FILE", help="YAML file with some or all settings")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="A.B=C",
+        dest="overrides",
+        help="one setting; may be given often, and wins over --config",
+    )
+
+
+def _add_result(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "result", metavar="RESULT", nargs="?", default=LATEST, help=f"default: {LATEST}"
+    )
+
+
+def _add_render(parser: argparse.ArgumentParser) -> None:
+    _add_result(parser)
+    parser.add_argument(
+        "--size", type=_size, default=(1280, 720), metavar="WxH", help="default: 1280x720"
+    )
+    parser.add_argument("--views", nargs="+", choices=VIEWS, default=list(VIEWS), metavar="VIEW")
+    parser.add_argument("--background", choices=("white", "black"), default="white")
+
+
+VIEWS = ("top", "perspective")
+
+
+def _add_doctor(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("path", metavar="PATH", nargs="?", help="a data folder to look at")
+    parser.add_argument("--dataset", metavar="NAME", help="layout, where the guess is wrong")
+    parser.add_argument("--sequence", metavar="NAME", help="which sequence, where PATH holds many")
+
+
+def _add_datasets(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", metavar="NAME", nargs="?", help="only this layout")
+
+
+def _add_test(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "pytest_arguments", metavar="ARGUMENT", nargs="*", help="handed on to pytest"
+    )
+
+
+def _positive(text: str) -> int:
+    value = _not_negative(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError("expected a whole number of at least 1, found '0'")
+    return value
+
+
+def _not_negative(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number, found '{text}'")
+    return int(text)
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, cross, height = text.lower().partition("x")
+    if not (cross and width.isdecimal() and height.isdecimal() and int(width) * int(height)):
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT as in 1280x720, found '{text}'")
+    return int(width), int(height)

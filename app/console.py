@@ -1,0 +1,173 @@
+"""What a person sees while something runs and after: progress, warnings, tables, next steps.
+
+Owns all printing of the verbs. Rich on a terminal; plain lines where the output is a file or a
+pipe. Results go to stdout, progress and warnings to stderr.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as RichProgress
+from rich.table import Table
+from rich.text import Text
+
+PLAIN_EVERY_S = 5.0  # between progress lines where there is no terminal
+PROGRAM = "python3 -m app"
+
+stdout = Console()
+stderr = Console(stderr=True)
+
+
+class Progress:
+    """A sink of the run loop: frames done, frames per second, status of the camera."""
+
+    def __init__(self) -> None:
+        self._bar: RichProgress | None = None
+        self._task: Any = None
+        self._n_frames = self._done = self._lost = 0
+        self._started_s = self._printed_s = 0.0
+
+    def start(self, sequence: Any, n_frames: int, config: Any) -> None:
+        self._n_frames = n_frames
+        self._started_s = self._printed_s = time.monotonic()
+        camera = sequence.camera
+        stderr.print(
+            f"{sequence.name} ({sequence.dataset}): {n_frames} frames, "
+            f"{camera.width}x{camera.height}",
+            highlight=False,
+        )
+        if stderr.is_terminal:
+            self._bar = RichProgress(
+                TextColumn("tracking"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[rate]}"),
+                TextColumn("{task.fields[status]}"),
+                TimeRemainingColumn(),
+                console=stderr,
+            )
+            self._task = self._bar.add_task("", total=n_frames, rate="", status="")
+            self._bar.start()
+
+    def frame(self, frame: Any, result: Any) -> None:
+        self._done += 1
+        status = str(result.status)
+        self._lost += status != "OK"
+        now = time.monotonic()
+        rate = f"{self._done / max(now - self._started_s, 1e-6):.1f} fps"
+        if self._bar is not None:
+            colour = "green" if status == "OK" else "red"
+            shown = f"[{colour}]{status}[/]" + (f", {self._lost} lost" if self._lost else "")
+            self._bar.update(self._task, completed=self._done, rate=rate, status=shown)
+        elif now - self._printed_s >= PLAIN_EVERY_S or self._done == self._n_frames:
+            self._printed_s = now
+            lost = f", {self._lost} lost" if self._lost else ""
+            stderr.print(
+                f"  {self._done} of {self._n_frames} frames, {rate}{lost}", highlight=False
+            )
+
+    def finish(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+@contextmanager
+def warnings() -> Iterator[None]:
+    """Within the block, warnings of the library appear on stderr (above the progress bar)."""
+    logger = logging.getLogger("dyob")
+    handler: logging.Handler
+    if stderr.is_terminal:
+        handler = RichHandler(console=stderr, show_time=False, show_path=False)
+    else:
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+    handler.setLevel(logging.WARNING)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+@contextmanager
+def working(what: str, quiet: bool = False) -> Iterator[None]:
+    """Say that something without frames is under way."""
+    if quiet:
+        yield
+    elif stderr.is_terminal:
+        with stderr.status(f"{what} ..."):
+            yield
+    else:
+        stderr.print(f"{what} ...", highlight=False)
+        yield
+
+
+def metrics(metrics: dict[str, Any], timings: dict[str, Any], folder: str) -> None:
+    """The table of a run: counts, errors with units, times."""
+    from pipelines.evaluation.table import metrics_table, metrics_text
+
+    if stdout.is_terminal:
+        table = Table(title=folder, title_justify="left", show_header=False)
+        table.add_column()
+        table.add_column(justify="right")
+        table.add_column(style="dim")
+        for row in metrics_table(metrics, timings):
+            table.add_row(*(Text(cell) for cell in row))
+        stdout.print(table)
+    else:
+        stdout.print(f"{folder}\n{metrics_text(metrics, timings)}", end="", **_PLAIN)
+    if metrics.get("run", {}).get("interrupted"):
+        stdout.print("Stopped before the end: the result holds the frames until then.", **_PLAIN)
+
+
+_PLAIN: dict[str, Any] = {"highlight": False, "markup": False, "soft_wrap": True}
+
+
+def rows(cells: Iterable[tuple[str, ...]], styles: tuple[str, ...] = ()) -> None:
+    """Aligned columns without borders, the last one wrapped on a terminal."""
+    table = Table.grid(padding=(0, 2))
+    cells = [tuple(row) for row in cells]
+    if not stdout.is_terminal:
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        for row in cells:
+            line = "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True))
+            stdout.print(line.rstrip(), **_PLAIN)
+        return
+    for row in cells:
+        padded = (*styles, *("",) * (len(row) - len(styles)))
+        table.add_row(*(Text(c, style=s) for c, s in zip(row, padded, strict=True)))
+    stdout.print(table)
+
+
+def pictures(files: Iterable[Path]) -> None:
+    """Name the files that were drawn."""
+    for file in files:
+        say(shorten(file))
+
+
+def next_steps(steps: dict[str, str]) -> None:
+    """What to type next: purpose -> verb and arguments."""
+    say("")
+    rows((f"{purpose}:", f"{PROGRAM} {command}") for purpose, command in steps.items())
+
+
+def say(text: str) -> None:
+    """One line on stdout, as it is."""
+    stdout.print(text, **_PLAIN)
+
+
+def shorten(path: Path) -> str:
+    """`path` from the working folder where it lies in it, for messages."""
+    path = Path(path).resolve()
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)

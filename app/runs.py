@@ -1,0 +1,132 @@
+"""The verbs that make and read result folders: demo, run, eval, render.
+
+Owns what a person is told about them. The work is in `pipelines` and `viz`.
+"""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from typing import Any
+
+from app import console
+from pipelines.errors import ConfigError, DyObError
+
+SIMULATED = "simulated"
+INTERRUPTED = 130
+
+
+def run(arguments: Namespace) -> int:
+    """`run PATH`: 0 when all frames were tried, 130 after Ctrl-C (the result is valid then)."""
+    from pipelines.config import load_config
+    from pipelines.datasets import open_sequence
+
+    overrides = list(arguments.overrides)
+    if arguments.seed is not None:
+        overrides.append(f"tracking.seed={arguments.seed}")
+    config = load_config(arguments.config, overrides)
+    sequence = open_sequence(
+        arguments.path, arguments.dataset, arguments.sequence, **_simulation_options(arguments)
+    )
+    span = {"start": arguments.start, "frames": arguments.frames, "stride": arguments.stride}
+    result = _process(sequence, config, arguments.output, arguments.quiet, span)
+    folder = console.shorten(result.folder)
+    if arguments.quiet:
+        console.say(folder)
+    else:
+        console.next_steps({"pictures": f"render {folder}", "errors again": f"eval {folder}"})
+    return _code(result)
+
+
+def demo(arguments: Namespace) -> int:
+    """`demo`: a small simulated sequence, its result, its pictures, and what to do next."""
+    from pipelines.config import load_config
+    from pipelines.datasets import open_sequence
+    from viz.render import render_result
+
+    quiet = arguments.quiet
+    sequence = open_sequence(f"{SIMULATED}:demo")
+    span = {"frames": arguments.frames}
+    result = _process(sequence, load_config(), arguments.output, quiet, span)
+    if result.metrics["run"]["interrupted"]:
+        return INTERRUPTED
+    with console.working("drawing the map and the trajectory", quiet):
+        pictures = render_result(result.folder)
+    console.pictures(pictures)
+    if not quiet:
+        console.next_steps(
+            {
+                "your own data": "run PATH",
+                "is it fit?": "doctor PATH",
+                "layouts": "datasets",
+                "settings": "config",
+            }
+        )
+    return _code(result)
+
+
+def evaluate(arguments: Namespace) -> int:
+    """`eval RESULT`: renew metrics.json and metrics.txt from the trajectories, and show them."""
+    from pipelines.evaluation import evaluate_result
+    from pipelines.io.result import load_result
+
+    metrics = evaluate_result(arguments.result)
+    result = load_result(arguments.result)
+    console.metrics(metrics, result.timings, console.shorten(result.folder))
+    return 0
+
+
+def render(arguments: Namespace) -> int:
+    """`render RESULT`: PNG files in the result folder."""
+    from pipelines.io.folder import open_result_folder
+    from viz.render import render_result
+
+    folder = open_result_folder(arguments.result)
+    with console.working(f"drawing {console.shorten(folder)}"):
+        pictures = render_result(
+            folder,
+            size=arguments.size,
+            views=tuple(arguments.views),
+            background=arguments.background,
+        )
+    console.pictures(pictures)
+    return 0
+
+
+def _process(sequence: Any, config: Any, output: str | None, quiet: bool, span: dict) -> Any:
+    from pipelines.run import run as run_sequence
+
+    sinks = () if quiet else (console.Progress(),)
+    with console.warnings():
+        result = run_sequence(sequence, config, output, **span, sinks=sinks)
+    if not quiet:
+        console.metrics(result.metrics, result.timings, console.shorten(result.folder))
+    return result
+
+
+def _code(result: Any) -> int:
+    """The exit code; a run without one tracked frame is a failure that a script must see."""
+    counts = result.metrics["run"]
+    if counts["interrupted"]:
+        return INTERRUPTED
+    if counts["tracked"] == 0:
+        raise DyObError(
+            f"no frame could be tracked (see {console.shorten(result.folder)}/run.log); "
+            "'python3 -m app doctor PATH' says whether the data are fit"
+        )
+    return 0
+
+
+def _simulation_options(arguments: Namespace) -> dict[str, Any]:
+    """Options that only simulated sequences take."""
+    simulated = arguments.dataset == SIMULATED or arguments.path.startswith(f"{SIMULATED}:")
+    if arguments.degrade and not simulated:
+        raise ConfigError(
+            f"--degrade wears the inputs of simulated sequences; {arguments.path} is none: "
+            "leave --degrade out or run simulated:street"
+        )
+    options: dict[str, Any] = {}
+    if simulated and arguments.degrade:
+        options["degrade"] = True
+    if simulated and arguments.seed is not None:
+        options["seed"] = arguments.seed
+    return options
