@@ -102,7 +102,7 @@ def _packages(environment: Environment) -> Iterator[Finding]:
             words = ", ".join(pin.replace("==", " ") for pin in pins)
             yield Finding(Verdict.OK, f"packages: {section}", words)
             continue
-        found = ", ".join(f"{pin} (here: {have})" for pin, have in missing.items())
+        found = ", ".join(_lacking(pin, have) for pin, have in missing.items())
         if section == CORE and set_up_is_off:
             words = f"DYOB_NO_SETUP=1 is set, and this Python lacks {found}"
             absent = "nothing" in missing.values()
@@ -111,14 +111,19 @@ def _packages(environment: Environment) -> Iterator[Finding]:
             words = "not set up yet; 'python3 -m app demo' does it"
             yield Finding(Verdict.NOTE, f"packages: {section}", words)
         else:
-            when = "by 'python3 -m app test'" if section == DEVELOPMENT else "when first needed"
-            words = f"not installed; they are {when}"
+            who = "'python3 -m app test'" if section == DEVELOPMENT else "what first needs them"
+            words = f"not installed; {who} brings them"
             yield Finding(Verdict.NOTE, f"packages: {section}", words)
     if not has_venv_module():
         name = f"python{sys.version_info.major}.{sys.version_info.minor}-venv"
         command = system_libraries.install_command([name])
         words = f"this Python cannot make virtual environments; on Debian type: {command}"
         yield Finding(_if_missing(), "venv", words)
+
+
+def _lacking(pin: str, found: str) -> str:
+    wanted = pin.replace("==", " ")
+    return wanted if found == "nothing" else f"{wanted} (it has {found})"
 
 
 def _libraries() -> Iterator[Finding]:
