@@ -120,7 +120,7 @@ def _explain_pip(environment: Environment, code: int) -> str:
         reason = f"pip was ended by signal {-code}"
     else:
         reason = f"pip ended with code {code}"
-    tail = "\n".join(f"    {line}" for line in lines[-8:])
+    tail = "\n".join(f"    {line[:160]}" for line in lines[-8:])
     sys.stderr.write(f"{tail}\n")
     return f"installing the packages failed: {reason} (all of pip's words: {environment.log})"
 
