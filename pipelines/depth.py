@@ -1,0 +1,231 @@
+"""Step 0: dense depth from a rectified stereo pair, and sub-pixel disparities of single points.
+
+Owns stereo matching. Depth that comes with a sequence does not pass through here.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import DepthConfig
+from pipelines.types import Array, Image, StereoCamera
+
+MAX_DEPTH_M = 1000.0  # a disparity that says more than this is noise about zero
+SGBM_SCALE = 16.0  # OpenCV's fixed point: its disparities are steps of 1/16 px
+HALF_SIZE_ERROR_PX = 0.5  # of disparities matched at half size, granted on top of the check
+SLOPE_PX = 0.75  # neighbours within this are one surface, whose steps of 1/16 px are averaged out
+MAX_STEP_PX = 0.5  # a refinement that goes farther has found something else
+GRADIENT_NOISE = 4.0  # (grey levels / px)^2, keeps the step small where there is no texture
+
+POINT_WINDOW_PX = 5  # half size of the patch that a single point is refined on
+POINT_SIGMA_PX = 3.0  # its weights fall off towards depth edges that may cross the patch
+POINT_ITERATIONS = 3
+MAX_POINT_CHANGE_PX = 0.75
+MAX_POINT_SLOPE = 1.0  # px of disparity per px of image, beyond which no real surface was fitted
+MAX_POINT_RESIDUAL = 25.0  # grey levels, RMS over the patch
+MIN_POINT_GRADIENT = 2.0  # grey levels / px, RMS over the patch, along the row
+
+
+class StereoDepth:
+    """Semi-global matching with a left-right check and one dense sub-pixel step.
+
+    Sources: Hirschmueller, PAMI 2008 (OpenCV's three-way SGBM); Lucas and Kanade, 1981.
+    Deviation: the check matches the right view at half size, at a sixth of the time of a full
+    second match; on our rendered street it lets through fewer wrong pixels (1.1 against 1.3 %).
+    """
+
+    def __init__(self, config: DepthConfig, camera: StereoCamera) -> None:
+        self._camera, self._config = camera, config
+        self._search_px = _multiple_of_16(config.sgbm_num_disparities)
+        self._half_search_px = _multiple_of_16(self._search_px // 2)
+        block = config.sgbm_block_size
+        self._matcher = _make_matcher(self._search_px, block)
+        self._right_matcher = _make_matcher(self._half_search_px, block)
+        v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
+        self._u, self._v = u, v
+
+    def compute(self, image: Image, image_right: Image) -> NDArray[np.float32]:
+        """Depth (H, W) float32 in metres registered to `image`, NaN unknown.
+
+        Both images (H, W) grey or (H, W, 3) RGB uint8 of the camera's size; else ValueError.
+        """
+        return self.depth_of(self.disparity(image, image_right))
+
+    def depth_of(self, disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Depth in metres of disparities in pixels; NaN where it is NaN or beyond 1 km."""
+        bf = np.float32(self._camera.bf)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(disparity_px >= bf / MAX_DEPTH_M, bf / disparity_px, np.float32(np.nan))
+
+    def disparity(self, image: Image, image_right: Image) -> NDArray[np.float32]:
+        """Disparity u_L - u_R (H, W) float32 in pixels on the grid of `image`, NaN unknown."""
+        left, right = to_gray(image), to_gray(image_right)
+        size = (self._camera.height, self._camera.width)
+        if left.shape != size or right.shape != size:
+            raise ValueError(
+                f"StereoDepth: expected two images of {size}, found {left.shape}, {right.shape}"
+            )
+        disparity = _match(self._matcher, left, right, self._search_px)
+        known = self._agrees_with_right(disparity, left, right)
+        disparity = self._refine(disparity, known, left, right)
+        disparity[~known] = np.nan
+        return disparity
+
+    def _agrees_with_right(
+        self, disparity: NDArray[np.float32], left: Image, right: Image
+    ) -> NDArray[np.bool_]:
+        """Left-right check: whether the right view, matched by itself, says the same."""
+        # Mirrored, the right view is the left one of a pair, so the same matcher serves.
+        mirrored = _match(
+            self._right_matcher, _half_mirrored(right), _half_mirrored(left), self._half_search_px
+        )
+        from_right = np.ascontiguousarray(2 * mirrored[:, ::-1])
+        scale_u = from_right.shape[1] / self._camera.width
+        scale_v = from_right.shape[0] / self._camera.height
+        there = cv2.remap(
+            from_right,
+            (self._u - disparity + 0.5) * scale_u - 0.5,
+            (self._v + 0.5) * scale_v - 0.5,
+            cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=-1.0,
+        )
+        tolerance = self._config.left_right_max_px + HALF_SIZE_ERROR_PX
+        return (disparity > 0) & (there > 0) & (np.abs(there - disparity) <= tolerance)
+
+    def _refine(
+        self,
+        disparity: NDArray[np.float32],
+        known: NDArray[np.bool_],
+        left: Image,
+        right: Image,
+    ) -> NDArray[np.float32]:
+        """One Gauss-Newton step of every disparity on the grey levels of its neighbourhood.
+
+        SGBM prefers whole pixels and ends at 1/16 px; the step halves its error and more.
+        """
+        weight = known.astype(np.float32)
+        count = cv2.blur(weight, (5, 5)) + np.float32(1e-6)
+        mean = cv2.divide(cv2.blur(cv2.multiply(disparity, weight), (5, 5)), count)
+        smooth = np.where(cv2.absdiff(mean, disparity) < SLOPE_PX, mean, disparity)
+        left_f, right_f = left.astype(np.float32), right.astype(np.float32)
+        warped = cv2.remap(right_f, self._u - smooth, self._v, cv2.INTER_LINEAR)
+        slope = cv2.Sobel(
+            cv2.addWeighted(left_f, 0.5, warped, 0.5, 0), cv2.CV_32F, 1, 0, scale=1 / 8
+        )
+        error = cv2.multiply(cv2.subtract(warped, left_f), weight)
+        slope = cv2.multiply(slope, weight)
+        window = (7, 7)
+        # Both without their means, so that a difference in exposure does not shift disparities.
+        n = cv2.blur(weight, window) + np.float32(1e-6)
+        mean_slope = cv2.divide(cv2.blur(slope, window), n)
+        covariance = cv2.blur(cv2.multiply(slope, error), window) - cv2.multiply(
+            mean_slope, cv2.blur(error, window)
+        )
+        variance = cv2.blur(cv2.multiply(slope, slope), window)
+        step = cv2.divide(covariance, variance + np.float32(GRADIENT_NOISE))
+        return smooth + np.clip(step, -MAX_STEP_PX, MAX_STEP_PX)
+
+
+def refine_disparity(
+    gray_left: Image,
+    gray_right: Image,
+    uv_px: Array,
+    disparity_px: Array,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Disparities of single points, refined on grey levels along their rows.
+
+    gray_left, gray_right: (H, W) uint8. uv_px: (N, 2) in the left image. disparity_px: (N,)
+    within about half a pixel, NaN unknown. Returns disparities (N,), the given ones where the
+    refinement is not to be trusted, and (N,) bool where it is.
+
+    Fits disparity, its two slopes over the patch and an offset of brightness by Gauss-Newton
+    (Lucas and Kanade, 1981): roads and walls are seen at a slant, and a constant would be biased.
+    """
+    refined, ok = np.array(disparity_px, np.float64), np.isfinite(disparity_px)
+    if not ok.any():
+        return refined, ok
+    span = np.arange(-POINT_WINDOW_PX, POINT_WINDOW_PX + 1, dtype=np.float32)
+    dv, du = (grid.ravel() for grid in np.meshgrid(span, span, indexing="ij"))
+    weight = np.exp(-(du**2 + dv**2) / (2 * POINT_SIGMA_PX**2))
+    weight /= weight.sum()
+    left, right = gray_left.astype(np.float32), gray_right.astype(np.float32)
+    at = np.asarray(uv_px, np.float32)[ok]
+    u, v = at[:, :1] + du, at[:, 1:] + dv
+    patch = _sample(left, u, v)
+    slope = (_sample(left, u + 1, v) - _sample(left, u - 1, v)) / 2
+    jacobian = np.stack([slope, slope * du, slope * dv, np.ones_like(slope)], 1)  # (n, 4, P)
+    weighted = jacobian * weight
+    damping = np.diag([1e-3, 1e-3, 1e-3, 1e-6]).astype(np.float32)
+    to_step = np.linalg.solve(weighted @ jacobian.transpose(0, 2, 1) + damping, weighted)[:, :3]
+
+    plane = np.zeros((len(at), 3), np.float32)  # disparity, its slopes along u and v
+    plane[:, 0] = refined[ok]
+    shape = np.stack([np.ones_like(du), du, dv])
+    for _ in range(POINT_ITERATIONS):
+        error = _sample(right, u - plane @ shape, v) - patch
+        plane += (to_step @ error[..., None])[..., 0]
+    error = _sample(right, u - plane @ shape, v) - patch
+    error -= (error @ weight)[:, None]
+    residual = np.sqrt(error**2 @ weight)
+    good = np.abs(plane[:, 0] - refined[ok]) < MAX_POINT_CHANGE_PX
+    good &= (np.abs(plane[:, 1:]) < MAX_POINT_SLOPE).all(1) & (residual < MAX_POINT_RESIDUAL)
+    good &= np.sqrt(slope**2 @ weight) > MIN_POINT_GRADIENT
+    ok[np.flatnonzero(ok)[~good]] = False
+    refined[ok] = plane[good, 0]
+    return refined, ok
+
+
+def to_gray(image: Image) -> Image:
+    """Grey (H, W) uint8 of a grey or RGB image."""
+    if image.ndim == 2:
+        return image
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def _multiple_of_16(disparities: int) -> int:
+    return max(16, -(-disparities // 16) * 16)
+
+
+def _make_matcher(search_px: int, block_px: int) -> cv2.StereoSGBM:
+    return cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=search_px,
+        blockSize=block_px,
+        P1=8 * block_px**2,  # OpenCV's advice for one channel
+        P2=32 * block_px**2,
+        preFilterCap=31,
+        uniquenessRatio=5,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+
+
+def _match(
+    matcher: cv2.StereoSGBM, left: Image, right: Image, search_px: int
+) -> NDArray[np.float32]:
+    """Disparity (H, W) in pixels, 0 unknown; also of the leftmost columns, by widening the pair."""
+    wide = [
+        cv2.copyMakeBorder(image, 0, 0, search_px, 0, cv2.BORDER_REPLICATE)
+        for image in (left, right)
+    ]
+    steps = matcher.compute(wide[0], wide[1])[:, search_px:]
+    disparity = steps.astype(np.float32) / np.float32(SGBM_SCALE)
+    columns = np.arange(disparity.shape[1], dtype=np.float32)
+    disparity[(disparity < 0) | (disparity > columns)] = 0
+    return disparity
+
+
+def _half_mirrored(image: Image) -> Image:
+    half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return np.asarray(half[:, ::-1], np.uint8)
+
+
+def _sample(image: NDArray[np.float32], u: NDArray, v: NDArray) -> NDArray[np.float32]:
+    """Bilinear grey levels at (n, P) places; the nearest edge's outside the image."""
+    u, v = u.astype(np.float32, copy=False), v.astype(np.float32, copy=False)
+    sampled = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(sampled, np.float32)
