@@ -1,0 +1,83 @@
+"""All textures of a scene in one picture with their reductions, so that a look-up is one gather.
+
+Owns the placing of mip levels and anti-aliased look-ups. Knows no geometry.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.datasets.simulated.textures import Texture
+from pipelines.types import Array, Image
+
+_WIDTH = 4096
+_PAD = 2  # texels repeated around each level, so that bilinear look-ups wrap
+_ROW = 2048  # cv2.remap takes no side above 32767: look-ups go in rows of this many
+
+
+class Atlas:
+    """Textures by index, each with all its halved levels down to one texel."""
+
+    def __init__(self, textures: list[Texture]) -> None:
+        self._levels = [_reductions(t.rgba) for t in textures]
+        self.tile_m = np.array([t.tile_m for t in textures], np.float32)
+        self.size_px = np.array([t.rgba.shape[1::-1] for t in textures], np.float32)
+        deepest = max(len(levels) for levels in self._levels)
+        n = len(textures)
+        self._count = np.array([len(levels) for levels in self._levels], np.int32)
+        self._x0 = np.zeros(n * deepest, np.float32)
+        self._y0 = np.zeros(n * deepest, np.float32)
+        self._w = np.ones(n * deepest, np.float32)
+        self._h = np.ones(n * deepest, np.float32)
+        self._deepest = deepest
+        self._picture = self._place()
+
+    def _place(self) -> Image:
+        """Shelf packing, highest first."""
+        slots = [(i, j) for i, levels in enumerate(self._levels) for j in range(len(levels))]
+        slots.sort(key=lambda s: -self._levels[s[0]][s[1]].shape[0])
+        x = y = shelf = 0
+        for i, j in slots:
+            h, w = self._levels[i][j].shape[:2]
+            if x + w + 2 * _PAD > _WIDTH:
+                x, y, shelf = 0, y + shelf, 0
+            shelf = max(shelf, h + 2 * _PAD)
+            k = i * self._deepest + j
+            self._x0[k], self._y0[k], self._w[k], self._h[k] = x + _PAD, y + _PAD, w, h
+            x += w + 2 * _PAD
+        picture = np.zeros((y + shelf, _WIDTH, 4), np.uint8)
+        for i, j in slots:
+            level = np.pad(self._levels[i][j], ((_PAD, _PAD), (_PAD, _PAD), (0, 0)), mode="wrap")
+            k = i * self._deepest + j
+            top, left = int(self._y0[k]) - _PAD, int(self._x0[k]) - _PAD
+            picture[top : top + level.shape[0], left : left + level.shape[1]] = level
+        return picture
+
+    def look_up(self, index: NDArray[np.int32], u: Array, v: Array, step_px: Array) -> Image:
+        """RGBA (N, 4) of textures `index` (N,) at (u, v) in tiles.
+
+        step_px: (N,) distance in texels (of the full level) between neighbouring image pixels.
+        """
+        level = np.log2(np.maximum(step_px, 1.0)) + np.float32(0.35)
+        level = np.minimum(level.astype(np.int32), self._count[index] - 1)
+        slot = index * self._deepest + level
+        x = (u - np.floor(u)) * self._w[slot] + self._x0[slot] - np.float32(0.5)
+        y = (v - np.floor(v)) * self._h[slot] + self._y0[slot] - np.float32(0.5)
+        N = len(x)
+        rows = -(-N // _ROW)
+        padded = np.zeros((2, rows * _ROW), np.float32)
+        padded[0, :N], padded[1, :N] = x, y
+        map_x, map_y = padded.reshape(2, rows, _ROW)
+        return cv2.remap(self._picture, map_x, map_y, cv2.INTER_LINEAR).reshape(-1, 4)[:N]
+
+
+def _reductions(rgba: Image) -> list[Image]:
+    """`rgba` and its averages over 2x2, 4x4, ... pixels."""
+    levels = [rgba]
+    while max(levels[-1].shape[:2]) > 1:
+        h, w = levels[-1].shape[:2]
+        half = (max(w // 2, 1), max(h // 2, 1))
+        levels.append(cv2.resize(levels[-1], half, interpolation=cv2.INTER_AREA))
+    return levels
