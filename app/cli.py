@@ -119,7 +119,9 @@ def main(argv: Sequence[str]) -> int:
         sys.stdout.write(parser.format_help())
         return 0
     if arguments.verb == "test":
-        arguments.pytest_arguments += extra
+        # argparse would tear flags from their values, which it takes for its own words.
+        words = argv[list(argv).index("test") + 1 :]
+        arguments.pytest_arguments = [word for word in words if word != "--debug"]
     elif extra:
         parser.error(f"'{arguments.verb}' does not know {' '.join(extra)}")
     verb = VERBS[arguments.verb]

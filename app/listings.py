@@ -11,12 +11,9 @@ import inspect
 import re
 from argparse import Namespace
 from dataclasses import fields, is_dataclass
-from difflib import get_close_matches
-from importlib import import_module
 from typing import Any
 
 from app import console
-from pipelines.errors import ConfigError
 
 _COMMENT_COLUMN = 36
 
@@ -75,17 +72,11 @@ def field_comments(section: type) -> dict[str, str]:
 
 def datasets(arguments: Namespace) -> int:
     """`datasets`: name, what it is, and the files that are expected."""
-    from pipelines.datasets import DATASETS
+    from pipelines.datasets import DATASETS, load_dataset
 
-    names = [arguments.name] if arguments.name else list(DATASETS)
-    for name in names:
-        if name not in DATASETS:
-            near = get_close_matches(name, DATASETS, 1, 0.0)
-            raise ConfigError(
-                f"unknown layout '{name}'; the nearest is {near[0]}, all: {', '.join(DATASETS)}"
-            )
-        module, _, class_name = DATASETS[name].partition(":")
-        layout = getattr(import_module(module), class_name)
-        console.say(f"{name}: {(inspect.getdoc(layout) or '').splitlines()[0]}")
-        console.say("\n".join(f"    {line}" for line in layout.layout.splitlines()))
+    for name in [arguments.name] if arguments.name else DATASETS:
+        dataset = load_dataset(name)
+        console.say(f"{name}: {(inspect.getdoc(dataset) or '').splitlines()[0]}")
+        for line in dataset.layout.splitlines():
+            console.say(f"    {line}")
     return 0

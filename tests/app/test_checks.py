@@ -1,0 +1,44 @@
+"""The test verb: every check runs, the closing line tells, the exit code follows."""
+
+from __future__ import annotations
+
+import subprocess
+from argparse import Namespace
+
+import pytest
+
+from app import checks
+
+
+@pytest.fixture
+def commands(monkeypatch):
+    """Commands that were run, and the modules whose run fails."""
+    seen: list[list[str]] = []
+    failing: set[str] = set()
+
+    def run(command, cwd, check):
+        seen.append(command[2:])
+        return subprocess.CompletedProcess(command, int(command[2] in failing))
+
+    monkeypatch.setattr(subprocess, "run", run)
+    return seen, failing
+
+
+def test_all_checks_run_with_pytest_last(commands, capsys) -> None:
+    seen, _ = commands
+    assert checks.test(Namespace(pytest_arguments=["-k", "config"])) == 0
+    assert [command[0] for command in seen] == ["ruff", "ruff", "mypy", "pytest"]
+    assert seen[-1] == ["pytest", "-k", "config"]
+    closing = capsys.readouterr().out.splitlines()[-1]
+    assert closing.startswith("dyob-slam: all checks passed in ")
+
+
+@pytest.mark.parametrize("module", ["ruff", "mypy", "pytest"])
+def test_one_failure_fails_the_whole_and_stops_nothing(commands, capsys, module) -> None:
+    seen, failing = commands
+    failing.add(module)
+    assert checks.test(Namespace(pytest_arguments=[])) == 1
+    assert len(seen) == 4
+    closing = capsys.readouterr().out.splitlines()[-1]
+    assert closing.startswith("dyob-slam: FAILED: ")
+    assert module in closing
