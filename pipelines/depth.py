@@ -5,6 +5,8 @@ Owns stereo matching. Depth that comes with a sequence does not pass through her
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,8 @@ MAX_DEPTH_M = 1000.0  # a disparity that says more than this is noise about zero
 SGBM_SCALE = 16.0  # OpenCV's fixed point: its disparities are steps of 1/16 px
 HALF_SIZE_ERROR_PX = 0.5  # of disparities matched at half size, granted on top of the check
 SLOPE_PX = 0.75  # neighbours within this are one surface, whose steps of 1/16 px are averaged out
+WINDOW_PX = 7  # side of the patches that the dense refinement compares
+MIN_CORRELATION = 0.2  # of the two views' patches; asphalt has more, a clear sky has none
 MAX_STEP_PX = 0.5  # a refinement that goes farther has found something else
 GRADIENT_NOISE = 4.0  # (grey levels / px)^2, keeps the step small where there is no texture
 
@@ -69,8 +73,8 @@ class StereoDepth:
             )
         disparity = _match(self._matcher, left, right, self._search_px)
         known = self._agrees_with_right(disparity, left, right)
-        disparity = self._refine(disparity, known, left, right)
-        disparity[~known] = np.nan
+        disparity, alike = self._refine(disparity, known, left, right)
+        disparity[~(known & alike)] = np.nan
         return disparity
 
     def _agrees_with_right(
@@ -101,10 +105,11 @@ class StereoDepth:
         known: NDArray[np.bool_],
         left: Image,
         right: Image,
-    ) -> NDArray[np.float32]:
-        """One Gauss-Newton step of every disparity on the grey levels of its neighbourhood.
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """One Gauss-Newton step of every disparity, and where both views look alike at all.
 
-        SGBM prefers whole pixels and ends at 1/16 px; the step halves its error and more.
+        SGBM prefers whole pixels and ends at 1/16 px; the step halves its error and more. Where
+        patches do not correlate, as in the sky, its smoothness alone has made up a disparity.
         """
         weight = known.astype(np.float32)
         count = cv2.blur(weight, (5, 5)) + np.float32(1e-6)
@@ -112,21 +117,19 @@ class StereoDepth:
         smooth = np.where(cv2.absdiff(mean, disparity) < SLOPE_PX, mean, disparity)
         left_f, right_f = left.astype(np.float32), right.astype(np.float32)
         warped = cv2.remap(right_f, self._u - smooth, self._v, cv2.INTER_LINEAR)
-        slope = cv2.Sobel(
-            cv2.addWeighted(left_f, 0.5, warped, 0.5, 0), cv2.CV_32F, 1, 0, scale=1 / 8
-        )
+        middle = cv2.addWeighted(left_f, 0.5, warped, 0.5, 0)
+        slope = cv2.multiply(cv2.Sobel(middle, cv2.CV_32F, 1, 0, scale=1 / 8), weight)
+        # All without their means, so that a difference in exposure does not shift disparities.
+        n = _box(weight) + np.float32(1e-6)
         error = cv2.multiply(cv2.subtract(warped, left_f), weight)
-        slope = cv2.multiply(slope, weight)
-        window = (7, 7)
-        # Both without their means, so that a difference in exposure does not shift disparities.
-        n = cv2.blur(weight, window) + np.float32(1e-6)
-        mean_slope = cv2.divide(cv2.blur(slope, window), n)
-        covariance = cv2.blur(cv2.multiply(slope, error), window) - cv2.multiply(
-            mean_slope, cv2.blur(error, window)
-        )
-        variance = cv2.blur(cv2.multiply(slope, slope), window)
+        covariance = _box(cv2.multiply(slope, error)) - _box(slope) / n * _box(error)
+        variance = _box(cv2.multiply(slope, slope))
         step = cv2.divide(covariance, variance + np.float32(GRADIENT_NOISE))
-        return smooth + np.clip(step, -MAX_STEP_PX, MAX_STEP_PX)
+        left_f, warped = _deviation(left_f, weight, n), _deviation(warped, weight, n)
+        product = _box(cv2.multiply(left_f, warped))
+        power = cv2.multiply(_box(cv2.multiply(left_f, left_f)), _box(cv2.multiply(warped, warped)))
+        alike = (product > 0) & (cv2.multiply(product, product) > MIN_CORRELATION**2 * power)
+        return smooth + np.clip(step, -MAX_STEP_PX, MAX_STEP_PX), alike
 
 
 def refine_disparity(
@@ -189,6 +192,18 @@ def _multiple_of_16(disparities: int) -> int:
     return max(16, -(-disparities // 16) * 16)
 
 
+def _box(image: NDArray[Any]) -> NDArray[np.float32]:
+    return np.asarray(cv2.blur(image, (WINDOW_PX, WINDOW_PX)), np.float32)
+
+
+def _deviation(
+    image: NDArray[Any], weight: NDArray[np.float32], mean_weight: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """`image` less the weighted mean of its neighbourhood, 0 where the weight is 0."""
+    mean = cv2.divide(_box(cv2.multiply(image, weight)), mean_weight)
+    return np.asarray(cv2.multiply(cv2.subtract(image, mean), weight), np.float32)
+
+
 def _make_matcher(search_px: int, block_px: int) -> cv2.StereoSGBM:
     return cv2.StereoSGBM.create(
         minDisparity=0,
@@ -197,9 +212,9 @@ def _make_matcher(search_px: int, block_px: int) -> cv2.StereoSGBM:
         P1=8 * block_px**2,  # OpenCV's advice for one channel
         P2=32 * block_px**2,
         preFilterCap=31,
-        uniquenessRatio=5,
-        speckleWindowSize=100,
-        speckleRange=2,
+        uniquenessRatio=10,
+        speckleWindowSize=200,
+        speckleRange=1,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
 
