@@ -1,0 +1,113 @@
+"""The verbs around a run: which settings and options reach it, and what its outcome means."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+
+from app import cli, console, runs
+from pipelines.errors import ConfigError, DyObError
+
+
+@pytest.fixture
+def calls(monkeypatch, tmp_path) -> dict[str, Any]:
+    """What the verbs hand to the library, whose functions are replaced; "counts" is the outcome."""
+    seen: dict[str, Any] = {"counts": {"interrupted": False, "tracked": 3}}
+
+    def open_sequence(path, dataset=None, name=None, **options):
+        seen["opened"] = (path, dataset, name, options)
+        return "the sequence"
+
+    def run(sequence, config=None, output=None, *, sinks=(), **span):
+        seen.update(sequence=sequence, config=config, output=output, sinks=sinks, span=span)
+        return SimpleNamespace(folder=tmp_path, metrics={"run": seen["counts"]}, timings={})
+
+    def render_result(folder, **options):
+        seen.update(rendered=folder, options=options)
+        return [Path(folder) / "renders" / "top.png"]
+
+    for name, function in (("pipelines.run", run), ("viz.render", render_result)):
+        module = ModuleType(name)
+        setattr(module, function.__name__, function)
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setattr("pipelines.datasets.open_sequence", open_sequence)
+    monkeypatch.setattr(console, "warnings", nullcontext)
+    return seen
+
+
+def words(line: str):
+    return cli.build_parser().parse_args(line.split())
+
+
+def test_flags_reach_the_run(calls) -> None:
+    line = "run data --dataset vdo --sequence a --start 2 --frames 5 --stride 3 --output out"
+    assert runs.run(words(f"{line} --set orb.n_features=900")) == 0
+    assert calls["opened"] == ("data", "vdo", "a", {})
+    assert calls["span"] == {"start": 2, "frames": 5, "stride": 3}
+    assert calls["output"] == "out"
+    assert calls["config"].orb.n_features == 900
+    assert isinstance(calls["sinks"][0], console.Progress)
+
+
+def test_the_seed_reaches_settings_and_simulation(calls) -> None:
+    runs.run(words("run simulated:street --seed 7 --degrade"))
+    assert calls["config"].tracking.seed == 7
+    assert calls["opened"][3] == {"seed": 7, "degrade": True}
+    runs.run(words("run data --seed 7"))
+    assert calls["config"].tracking.seed == 7
+    assert calls["opened"][3] == {}
+
+
+def test_degrade_is_refused_for_real_data(calls) -> None:
+    with pytest.raises(ConfigError, match="data is none"):
+        runs.run(words("run data --degrade"))
+    assert "opened" not in calls
+
+
+def test_wrong_settings_are_found_before_the_data_are_opened(calls) -> None:
+    with pytest.raises(ConfigError, match="unknown setting"):
+        runs.run(words("run data --set no.such=1"))
+    assert "opened" not in calls
+
+
+def test_quiet_prints_the_folder_alone(calls, capsys, tmp_path) -> None:
+    assert runs.run(words("run data --quiet")) == 0
+    assert calls["sinks"] == ()
+    assert capsys.readouterr().out == f"{tmp_path}\n"
+
+
+@pytest.mark.parametrize("line", ["run data", "run data --quiet", "demo"])
+def test_an_interrupted_run_ends_with_130(calls, line) -> None:
+    calls["counts"]["interrupted"] = True
+    verb = runs.demo if line == "demo" else runs.run
+    assert verb(words(line)) == 130
+    assert "rendered" not in calls
+
+
+def test_a_run_that_tracked_nothing_is_an_error(calls) -> None:
+    calls["counts"]["tracked"] = 0
+    with pytest.raises(DyObError, match="no frame could be tracked"):
+        runs.run(words("run data"))
+
+
+def test_the_demo_runs_renders_and_says_what_comes_next(calls, capsys, tmp_path) -> None:
+    assert runs.demo(words("demo --frames 4")) == 0
+    assert calls["opened"][0] == "simulated:demo"
+    assert calls["span"] == {"frames": 4}
+    assert calls["rendered"] == tmp_path
+    said = capsys.readouterr().out
+    assert "top.png" in said
+    assert "python3 -m app run PATH" in said
+
+
+def test_render_hands_on_its_flags(calls, capsys, tmp_path) -> None:
+    (tmp_path / "camera_tum.txt").write_text("")
+    line = f"render {tmp_path} --size 640x360 --views top --background black"
+    assert runs.render(words(line)) == 0
+    assert calls["rendered"] == tmp_path.resolve()
+    assert calls["options"] == {"size": (640, 360), "views": ("top",), "background": "black"}
