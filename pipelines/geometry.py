@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.types import Array, StereoCamera
 
+MIN_DEPTH_M = 0.05  # a point nearer than this, or behind the camera, cannot be observed
+
 
 def invert_T(T: Array) -> Array:
     """Inverse of rigid motions (..., 4, 4), without a general matrix inverse."""
@@ -102,6 +104,27 @@ def project_stereo(camera: StereoCamera, points_camera: Array) -> Array:
     x, y, z = points_camera.T
     u = camera.fx * x / z + camera.cx
     return np.stack([u, camera.fy * y / z + camera.cy, u - camera.bf / z], -1)
+
+
+def projection_jacobian(camera: StereoCamera, points_camera: Array) -> Array:
+    """d(u_L, v, u_R) / d(point in the camera), (N, 3, 3)."""
+    x, y, z = points_camera.T
+    z = np.maximum(z, MIN_DEPTH_M)
+    J = np.zeros((len(z), 3, 3))
+    J[:, 0, 0] = J[:, 2, 0] = camera.fx / z
+    J[:, 1, 1] = camera.fy / z
+    J[:, 0, 2] = -camera.fx * x / z**2
+    J[:, 1, 2] = -camera.fy * y / z**2
+    J[:, 2, 2] = (camera.bf - camera.fx * x) / z**2
+    return J
+
+
+def pose_jacobian(projection_jacobians: Array, points_camera: Array) -> Array:
+    """d(u_L, v, u_R) / d(right perturbation [omega, v] of T_world_camera), (N, 3, 6)."""
+    J = np.empty((len(points_camera), 3, 6))
+    J[:, :, :3] = projection_jacobians @ skew(points_camera)
+    J[:, :, 3:] = -projection_jacobians
+    return J
 
 
 def backproject(camera: StereoCamera, uv_px: Array, depth_m: Array) -> Array:

@@ -9,13 +9,14 @@ centre of the top left pixel at (0, 0).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 Image = NDArray[np.uint8]
 
 
@@ -187,6 +188,10 @@ class Features:
     def __getitem__(self, which: NDArray) -> Features:
         """The features chosen by a boolean mask or an index array."""
         return Features(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    def with_depth(self, depth_m: Array) -> Features:
+        """The same features with depths (N,) in metres."""
+        return replace(self, depth_m=depth_m)
 
     @classmethod
     def empty(cls) -> Features:

@@ -1,0 +1,65 @@
+"""Sub-pixel places of tracked points: Lucas-Kanade alignment, fused with given optical flow.
+
+Owns the measurement of where last frame's points are now. Knows no poses.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.types import Array, Image
+
+_WINDOW_PX = 15  # side of the aligned patch
+_PYRAMID_LEVELS = 1  # one coarser level: the predictions are good to some pixels
+_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.005)
+
+
+def align_patches(
+    gray_from: Image, gray_to: Image, uv_from_px: Array, predicted_px: Array, max_shift_px: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Places (N, 2) in `gray_to` of the patches around `uv_from_px` (N, 2) of `gray_from`.
+
+    Starts at `predicted_px` (N, 2). The second answer (N,) says which converged within
+    `max_shift_px` of their prediction.
+    """
+    n = len(uv_from_px)
+    if n == 0:
+        return np.empty((0, 2)), np.zeros(0, bool)
+    known = np.isfinite(predicted_px).all(axis=1)
+    start = np.where(known[:, None], predicted_px, uv_from_px)
+    placed, status, _ = cv2.calcOpticalFlowPyrLK(
+        gray_from,
+        gray_to,
+        np.ascontiguousarray(uv_from_px[:, None], dtype=np.float32),
+        np.ascontiguousarray(start[:, None], dtype=np.float32),
+        winSize=(_WINDOW_PX, _WINDOW_PX),
+        maxLevel=_PYRAMID_LEVELS,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        criteria=_STOP,
+    )
+    uv = placed[:, 0].astype(np.float64)
+    shift = np.linalg.norm(uv - start, axis=1)
+    return uv, known & (status[:, 0] > 0) & (shift <= max_shift_px)
+
+
+def fuse_measurements(
+    uv_a_px: Array, ok_a: NDArray[np.bool_], sigma_a_px: float,
+    uv_b_px: Array, ok_b: NDArray[np.bool_], sigma_b_px: float,
+) -> tuple[Array, NDArray[np.bool_], Array]:  # fmt: skip
+    """Inverse-variance mean of two measurements (N, 2) of the same places.
+
+    Where only one is valid it stands alone. Where both are and they differ by more than three
+    standard deviations, one of them is wrong and the more precise source is believed.
+    Returns places (N, 2), validity (N,) and standard deviations (N,) in px.
+    """
+    weight_a, weight_b = sigma_a_px**-2, sigma_b_px**-2
+    mean = (weight_a * uv_a_px + weight_b * uv_b_px) / (weight_a + weight_b)
+    agree = np.linalg.norm(uv_a_px - uv_b_px, axis=1) <= 3.0 * np.hypot(sigma_a_px, sigma_b_px)
+    a_alone = ok_a & (~ok_b | (~agree & (sigma_a_px <= sigma_b_px)))
+    b_alone = ok_b & ~a_alone & (~ok_a | ~agree)
+    uv = np.where(a_alone[:, None], uv_a_px, np.where(b_alone[:, None], uv_b_px, mean))
+    sigma = np.full(len(uv), (weight_a + weight_b) ** -0.5)
+    sigma[a_alone], sigma[b_alone] = sigma_a_px, sigma_b_px
+    return uv, ok_a | ok_b, sigma

@@ -1,0 +1,81 @@
+"""Evenly spread ORB features on the static part of an image.
+
+Owns detection, spreading and description. Knows no poses and no map.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import OrbConfig
+from pipelines.types import Array, Features, Image
+
+_OVERSAMPLING = 2.0  # corners detected per feature kept, so that spreading has a choice
+
+
+class OrbExtractor:
+    """Detects, spreads and describes ORB corners (paper, section ORB feature extraction).
+
+    Holds the OpenCV detectors, which are costly to make; it keeps nothing from image to image.
+    """
+
+    def __init__(self, config: OrbConfig) -> None:
+        self.config = config
+        self._orb = cv2.ORB_create(
+            nfeatures=int(config.n_features * _OVERSAMPLING),
+            scaleFactor=config.scale_factor,
+            nlevels=config.n_levels,
+            fastThreshold=config.fast_threshold,
+            edgeThreshold=19,
+            patchSize=31,
+        )
+
+    def extract(self, gray: Image, static: NDArray[np.bool_] | None = None) -> Features:
+        """ORB features of a grey image (H, W), on pixels where `static` (H, W) is True.
+
+        Depths are left unknown (NaN). At most `n_features`, the strongest of each image cell.
+        """
+        mask = None if static is None else static.view(np.uint8) * np.uint8(255)
+        keypoints = self._orb.detect(gray, mask)
+        if not keypoints:
+            return Features.empty()
+        table = np.array([(*k.pt, k.response, k.octave) for k in keypoints])
+        kept = spread_evenly(table[:, :2], table[:, 2], gray.shape[:2], self.config.n_features)
+        keypoints, descriptors = self._orb.compute(gray, [keypoints[i] for i in kept])
+        if descriptors is None or not keypoints:
+            return Features.empty()
+        table = np.array([(*k.pt, k.octave, k.angle, k.response) for k in keypoints])
+        return Features(
+            table[:, :2],
+            table[:, 2].astype(np.int32),
+            table[:, 3].astype(np.float32),
+            table[:, 4].astype(np.float32),
+            descriptors,
+            np.full(len(keypoints), np.nan),
+        )
+
+
+def spread_evenly(
+    uv_px: Array, response: Array, shape: tuple[int, int], n_wanted: int
+) -> NDArray[np.int64]:
+    """Indices of about `n_wanted` corners spread over the image, the strongest of each cell first.
+
+    uv_px: (N, 2). response: (N,). shape: (H, W) in pixels. Corners are ranked inside square cells
+    of about four wanted corners each, and taken rank by rank until there are enough.
+    """
+    if len(uv_px) <= n_wanted:
+        return np.arange(len(uv_px))
+    cell_px = max(8.0, np.sqrt(4.0 * shape[0] * shape[1] / n_wanted))
+    columns = int(np.ceil(shape[1] / cell_px))
+    cell = (uv_px[:, 1] // cell_px).astype(np.int64) * columns + (uv_px[:, 0] // cell_px).astype(
+        np.int64
+    )
+    order = np.lexsort((-response, cell))
+    sorted_cell = cell[order]
+    starts = np.flatnonzero(np.r_[True, sorted_cell[1:] != sorted_cell[:-1]])
+    sizes = np.diff(np.r_[starts, len(cell)])
+    rank = np.arange(len(cell)) - np.repeat(starts, sizes)
+    by_rank = np.lexsort((-response[order], rank))
+    return np.sort(order[by_rank[:n_wanted]])

@@ -1,0 +1,64 @@
+"""Dense RGB-D odometry by Open3D: the third motion hypothesis, always seeded with a guess.
+
+Excellent where it converges and wild where it does not, so it is used only where the hypotheses
+that rest on points are weak, and must win by inliers like them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.types import Array, Image, StereoCamera
+
+_ITERATIONS = (10, 5, 3)  # per pyramid level, coarse to fine
+_MIN_VALID_PIXELS = 2000  # fewer pixels with depth cannot fix a pose
+_MAX_DISPARITY_JUMP = 0.07  # depths that differ by more than this share of z do not correspond
+
+
+def estimate_rgbd_odometry(
+    camera: StereoCamera,
+    previous: tuple[Image, NDArray[np.float32]],
+    current: tuple[Image, NDArray[np.float32]],
+    T_prev_curr: Array,
+    max_depth_m: float,
+) -> Array | None:
+    """T_prev_curr (4, 4) of two frames (grey image, depth in m), or None where it fails.
+
+    Depths are NaN where unknown *or dynamic*: moving pixels must be unknown in both frames.
+    T_prev_curr: the guess that seeds the iteration.
+    """
+    import open3d as o3d
+    from open3d.t.pipelines import odometry
+
+    if min(np.isfinite(depth).sum() for _, depth in (previous, current)) < _MIN_VALID_PIXELS:
+        return None
+    source, target = (_rgbd_image(o3d, *view, max_depth_m) for view in (current, previous))
+    try:
+        result = odometry.rgbd_odometry_multi_scale(
+            source,
+            target,
+            o3d.core.Tensor(camera.K),
+            o3d.core.Tensor(np.ascontiguousarray(T_prev_curr)),
+            1.0,
+            max_depth_m,
+            [odometry.OdometryConvergenceCriteria(n) for n in _ITERATIONS],
+            odometry.Method.PointToPlane,
+            odometry.OdometryLossParams(_MAX_DISPARITY_JUMP * max_depth_m),
+        )
+    except RuntimeError:  # a singular system: too little structure in common
+        return None
+    T = result.transformation.numpy()
+    return T if np.isfinite(T).all() else None
+
+
+def _rgbd_image(o3d: Any, gray: Image, depth_m: NDArray[np.float32], max_depth_m: float) -> Any:
+    depth = np.nan_to_num(depth_m, nan=0.0, posinf=0.0)
+    depth[depth > max_depth_m] = 0.0
+    color = np.repeat(gray[..., None], 3, axis=2)
+    return o3d.t.geometry.RGBDImage(
+        o3d.t.geometry.Image(o3d.core.Tensor(color)),
+        o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth, dtype=np.float32))),
+    )

@@ -1,0 +1,109 @@
+"""What the front-end sees of one frame: grey image, disparity, static pixels and features.
+
+Owns the turning of a `Frame` into a `View`, once per frame. Knows no poses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.frontend.orb import OrbExtractor
+from pipelines.frontend.sampling import sample_disparity
+from pipelines.types import Array, Features, Frame, Image, StereoCamera
+
+_CONTRAST_WINDOW_PX = 31  # neighbourhood that the corner detector's contrast is measured against
+_CONTRAST_FLOOR = 10.0  # grey levels of standard deviation below which contrast is noise
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One frame, ready for tracking.
+
+    gray: (H, W) uint8. disparity_px: (H, W) float32, NaN where unknown. static: (H, W) bool, False
+    on movable objects and around them. features: ORB on static pixels, with depth.
+    flow_prev_to_curr_px: (H, W, 2) on the previous frame's pixels, or None.
+    """
+
+    frame_index: int
+    timestamp_s: float
+    image: Image
+    gray: Image
+    disparity_px: NDArray[np.float32]
+    static: NDArray[np.bool_]
+    features: Features
+    flow_prev_to_curr_px: NDArray[np.float32] | None
+
+    def is_static(self, uv_px: Array) -> NDArray[np.bool_]:
+        """Whether pixels (N, 2) lie in the image and off movable objects."""
+        H, W = self.static.shape
+        x = np.rint(np.nan_to_num(uv_px[:, 0], nan=-9.0)).astype(np.int64)
+        y = np.rint(np.nan_to_num(uv_px[:, 1], nan=-9.0)).astype(np.int64)
+        inside = (x >= 0) & (y >= 0) & (x < W) & (y < H)
+        return inside & self.static[np.clip(y, 0, H - 1), np.clip(x, 0, W - 1)]
+
+    def depth_of_static_m(self, camera: StereoCamera) -> NDArray[np.float32]:
+        """(H, W) float32 depth, NaN where unknown or on movable objects."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = np.float32(camera.bf) / self.disparity_px
+        return np.where(self.static, depth, np.float32(np.nan))
+
+
+def to_gray(image: Image) -> Image:
+    """(H, W) uint8 of a grey or RGB image."""
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+
+
+def static_pixels(
+    instance_labels: NDArray[np.int32] | None, shape: tuple[int, int], dilation_px: int
+) -> NDArray[np.bool_]:
+    """(H, W) bool: pixels off all movable instances, which are dilated against worn masks."""
+    if instance_labels is None:
+        return np.ones(shape, bool)
+    movable = (instance_labels > 0).astype(np.uint8)
+    size = 2 * dilation_px + 1
+    return cv2.dilate(movable, np.ones((size, size), np.uint8)) == 0
+
+
+def normalise_contrast(gray: Image) -> Image:
+    """(H, W) uint8 with even local contrast, so that corners in shade or on asphalt count too."""
+    size = (_CONTRAST_WINDOW_PX, _CONTRAST_WINDOW_PX)
+    mean = cv2.boxFilter(gray, cv2.CV_32F, size)
+    variance = cv2.sqrBoxFilter(gray, cv2.CV_32F, size) - mean * mean
+    sigma = np.sqrt(np.maximum(variance, 0.0)) + np.float32(_CONTRAST_FLOOR)
+    return cv2.add((gray - mean) / sigma * np.float32(40.0), 128.0, dtype=cv2.CV_8U)
+
+
+def make_view(
+    camera: StereoCamera,
+    frame: Frame,
+    depth_m: NDArray[np.float32] | None,
+    orb: OrbExtractor,
+    sigma_disparity_px: float,
+) -> View:
+    """The view of a frame whose depth (H, W) in m is known; None means no depth at all."""
+    gray = to_gray(frame.image)
+    if depth_m is None:
+        disparity = np.full(gray.shape, np.nan, np.float32)
+    else:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            disparity = np.where(depth_m > 0, np.float32(camera.bf) / depth_m, np.float32(np.nan))
+        disparity = disparity.astype(np.float32, copy=False)
+    static = static_pixels(frame.instance_labels, gray.shape, orb.config.mask_dilation_px)
+    features = orb.extract(normalise_contrast(gray), static)
+    disparity_at = sample_disparity(disparity, features.uv_px, sigma_disparity_px)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        features = features.with_depth(np.where(disparity_at > 0, camera.bf / disparity_at, np.nan))
+    return View(
+        frame.index,
+        frame.timestamp_s,
+        frame.image,
+        gray,
+        disparity,
+        static,
+        features,
+        frame.flow_prev_to_curr_px,
+    )

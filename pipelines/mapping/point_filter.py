@@ -1,0 +1,115 @@
+"""Refinement of map points by each new observation: one small Kalman update per point.
+
+Owns the structure-only update in inverse-depth form, which is close to linear even for points
+whose depth is hardly known. Poses are not changed here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.frontend.motion_only_ba import StereoObservations
+from pipelines.geometry import (
+    backproject,
+    invert_T,
+    pose_jacobian,
+    project_stereo,
+    projection_jacobian,
+    transform_points,
+)
+from pipelines.types import Array, StereoCamera
+
+_MAX_DEPTH_FACTOR = 3.0  # one update may change a depth at most by this factor
+
+
+def backprojection_covariance(
+    camera: StereoCamera, points_camera: Array, sigma_uv_px: Array, sigma_disparity_px: Array
+) -> Array:
+    """Covariances (N, 3, 3) in the camera of points (N, 3) seen at a pixel with a disparity."""
+    z = points_camera[:, 2]
+    J = np.zeros((len(z), 3, 3))
+    J[:, 0, 0], J[:, 1, 1] = z / camera.fx, z / camera.fy
+    J[:, :, 2] = -points_camera * (z / camera.bf)[:, None]
+    variance = np.stack([sigma_uv_px**2, sigma_uv_px**2, sigma_disparity_px**2], -1)
+    return (J * variance[:, None, :]) @ J.transpose(0, 2, 1)
+
+
+def make_points(
+    camera: StereoCamera,
+    T_world_camera: Array,
+    uv_px: Array,
+    disparity_px: Array,
+    sigma_uv_px: float,
+    sigma_disparity_px: Array,
+) -> tuple[Array, Array]:
+    """World points (N, 3) and covariances (N, 3, 3) from pixels (N, 2) and disparities (N,)."""
+    points = backproject(camera, uv_px, camera.bf / disparity_px)
+    sigma_uv = np.full(len(points), sigma_uv_px)
+    covariance = backprojection_covariance(camera, points, sigma_uv, sigma_disparity_px)
+    R = T_world_camera[:3, :3]
+    return transform_points(T_world_camera, points), R @ covariance @ R.T
+
+
+def refine_points(
+    camera: StereoCamera,
+    T_world_camera: Array,
+    pose_covariance: Array,
+    observations: StereoObservations,
+) -> tuple[Array, Array]:
+    """Points (N, 3) and covariances (N, 3, 3) after the observations of one image.
+
+    The pose's covariance (6, 6) counts as observation noise, so that a poor pose moves no point.
+    All points must lie in front of the camera.
+    """
+    R = T_world_camera[:3, :3]
+    points = transform_points(invert_T(T_world_camera), observations.points_world_m)
+    D = projection_jacobian(camera, points)
+    J_pose = pose_jacobian(D, points)
+    J_point = D @ R.T
+    residual = observations.uvr_px - project_stereo(camera, points)
+    mono = np.isnan(residual[:, 2])
+    residual[mono, 2] = 0.0
+    S = J_pose @ pose_covariance @ J_pose.transpose(0, 2, 1)
+    variance = observations.sigma_uv_px**2
+    for row, column in ((0, 0), (1, 1), (0, 2), (2, 0), (2, 2)):
+        S[:, row, column] += variance
+    S[:, 2, 2] += observations.sigma_disparity_px**2
+    P = observations.point_covariances_m2
+    J_point[mono, 2, :] = 0.0
+    S[mono, 2, :] = 0.0
+    S[mono, :, 2] = 0.0
+    S[mono, 2, 2] = 1.0
+    PJt = P @ J_point.transpose(0, 2, 1)
+    gain = np.linalg.solve(J_point @ PJt + S, PJt.transpose(0, 2, 1)).transpose(0, 2, 1)
+    step = np.einsum("nij,nj->ni", gain, residual) @ R
+    P_new = P - gain @ J_point @ P
+    moved, M = _step_in_inverse_depth(points, step)
+    M = R @ M @ R.T
+    P_new = M @ P_new @ M.transpose(0, 2, 1)
+    P_new = 0.5 * (P_new + P_new.transpose(0, 2, 1))
+    return transform_points(T_world_camera, moved), P_new
+
+
+def _step_in_inverse_depth(points: Array, step: Array) -> tuple[Array, Array]:
+    """Points (N, 3) moved by `step` (N, 3), taken as a step in (x/z, y/z, 1/z); and its Jacobian.
+
+    The same step in metres would overshoot for points of uncertain depth, even through z = 0.
+    """
+    z = points[:, 2]
+    ray = points[:, :2] / z[:, None]
+    ray_new = ray + (step[:, :2] - ray * step[:, 2:]) / z[:, None]
+    inverse_z = 1.0 / z - step[:, 2] / z**2
+    z_new = 1.0 / np.clip(inverse_z, 1.0 / (_MAX_DEPTH_FACTOR * z), _MAX_DEPTH_FACTOR / z)
+    moved = np.concatenate([ray_new, np.ones((len(z), 1))], 1) * z_new[:, None]
+    return moved, _inverse_depth_jacobian(ray_new, z_new) @ np.linalg.inv(
+        _inverse_depth_jacobian(ray, z)
+    )
+
+
+def _inverse_depth_jacobian(ray: Array, z: Array) -> Array:
+    """d(x, y, z) / d(x/z, y/z, 1/z), (N, 3, 3)."""
+    A = np.zeros((len(z), 3, 3))
+    A[:, 0, 0] = A[:, 1, 1] = z
+    A[:, :2, 2] = -ray * (z**2)[:, None]
+    A[:, 2, 2] = -(z**2)
+    return A
