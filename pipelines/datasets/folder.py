@@ -49,10 +49,10 @@ class FolderSequence(FileSequence):
             return False
         if any((path / name).is_file() for name in LISTS):
             return False
-        others = (path / "camera.yaml", path / "depth", path / "right")
-        marks = (path / "semantic", path / "object_pose.txt", path / "pose_gt.txt")
-        foreign = any(mark.exists() for mark in marks) or any(path.glob("*.y*ml"))
-        return others[0].is_file() or (any(o.is_dir() for o in others[1:]) and not foreign)
+        if (path / "camera.yaml").is_file():
+            return True
+        foreign = (path / "semantic").is_dir() or any(path.glob("*.y*ml"))
+        return not foreign and any((path / other).is_dir() for other in ("depth", "right"))
 
     @classmethod
     def _open(cls, root: Path, depth_scale: float | None = None, fps: float | None = None) -> Self:

@@ -56,10 +56,11 @@ class VdoSequence(FileSequence):
 
     @classmethod
     def matches(cls, path: Path) -> bool:
-        marks = ("semantic", "flow", "pose_gt.txt", "object_pose.txt")
+        # Truth files are no marks: what is opened may not depend on them.
+        marked = any((path / mark).is_dir() for mark in ("semantic", "flow"))
+        marked = marked and not (path / "camera.yaml").is_file()
         has_images = first_folder(path, ("image_0", "image")) is not None
-        marked = any((path / mark).exists() for mark in marks) or _find_settings(path) is not None
-        return has_images and marked
+        return has_images and (marked or _find_settings(path) is not None)
 
     @classmethod
     def _open(
