@@ -1,0 +1,148 @@
+"""What explains a map picture: title, legend, scale bar, and the marks at start and end.
+
+Owns words and marks over a drawn map. Knows no renderer.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipelines.io.result import Result
+from pipelines.types import Image
+from viz import style
+from viz.lines import line_color, line_scale
+from viz.scene import Scene, View
+
+BAR_STEPS = (1.0, 2.0, 5.0)
+
+
+def draw_legend(
+    picture: Image, scene: Scene, view: View, result: Result, *, dark: bool = False
+) -> None:
+    """Title at the top left, legend below, scale bar at the bottom right where there is a scale."""
+    ink = style.WHITE if dark else style.INK
+    panel = style.BACKGROUNDS["black" if dark else "white"]
+    _draw_ends(picture, scene, view, panel)
+    _draw_title(picture, result, view, ink, panel)
+    _draw_key(picture, scene, view, ink, panel, dark)
+    if view.px_per_m is not None:
+        _draw_scale_bar(picture, view, ink, panel)
+
+
+def scale_bar_m(px_per_m: float, longest_px: float) -> float:
+    """The longest of 1, 2, 5, 10, ... metres (or 0.5, 0.2, ...) that fits `longest_px`."""
+    power = 10.0 ** np.floor(np.log10(longest_px / px_per_m))
+    return float(max(s * power for s in BAR_STEPS if s * power * px_per_m <= longest_px * 1.0001))
+
+
+def title_lines(result: Result) -> list[str]:
+    """The run and, where the truth is known, its errors, in words."""
+    run: dict[str, Any] = result.metrics.get("run", {})
+    camera: dict[str, Any] = result.metrics.get("camera", {})
+    frames = len(result.timestamps_s)
+    of = f" of {run['frames']}" if run.get("frames") else ""
+    lines = [str(run.get("sequence") or result.folder.name)]
+    facts = [f"{frames}{of} frames tracked", f"{len(result.static_points_m):,} map points"]
+    lines.append(",  ".join(facts))
+    if camera.get("ate_rmse_m") is not None and camera.get("rpe_trans_rmse_m") is not None:
+        lines.append(
+            f"ATE {100 * camera['ate_rmse_m']:.2f} cm,  RPE {100 * camera['rpe_trans_rmse_m']:.2f} "
+            f"cm and {camera['rpe_rot_rmse_deg']:.3f}° a frame,  {camera['path_length_m']:.1f} m"
+        )
+    return lines
+
+
+def _sizes(view: View) -> tuple[int, int]:
+    """Text size and margin in pixels, legible whatever the picture's size."""
+    text = int(np.clip(view.size[0] / 75.0, 11, 40))
+    return text, round(1.2 * text)
+
+
+def _draw_title(picture: Image, result: Result, view: View, ink: Any, panel: Any) -> None:
+    text_px, margin = _sizes(view)
+    lines = title_lines(result)
+    sizes = [round(1.35 * text_px)] + [text_px] * (len(lines) - 1)
+    weights = [600] + [400] * (len(lines) - 1)
+    widths = [style.text_size(*args)[0] for args in zip(lines, sizes, weights, strict=True)]
+    height = sum(round(1.45 * size) for size in sizes)
+    pad = round(0.6 * text_px)
+    box = (margin - pad, margin - pad, margin + max(widths) + pad, margin + height + pad // 2)
+    style.draw_panel(picture, box, panel)
+    v = margin
+    for line, size, weight in zip(lines, sizes, weights, strict=True):
+        v += round(1.45 * size)
+        style.draw_text(picture, line, (margin, v - round(0.45 * size)), size, ink, weight)
+
+
+def _draw_key(picture: Image, scene: Scene, view: View, ink: Any, panel: Any, dark: bool) -> None:
+    import cv2
+
+    text_px, margin = _sizes(view)
+    entries = {line.label: line for line in scene.polylines if line.label}
+    if not entries:
+        return
+    step, sample = round(1.6 * text_px), round(2.6 * text_px)
+    width = sample + text_px + max(style.text_size(label, text_px)[0] for label in entries)
+    top = view.size[1] - margin - step * len(entries)
+    pad = round(0.6 * text_px)
+    style.draw_panel(
+        picture, (margin - pad, top - pad // 2, margin + width, view.size[1] - margin + pad), panel
+    )
+    for row, (label, line) in enumerate(reversed(entries.items())):
+        v = top + row * step + step // 2
+        thick = max(1, round(line.width_px * line_scale(view)))
+        ends = (margin, v), (margin + sample, v)
+        cv2.line(picture, *ends, line_color(line, dark), thick, cv2.LINE_AA)
+        at = (margin + sample + text_px // 2, v + round(0.36 * text_px))
+        style.draw_text(picture, label, at, text_px, ink)
+
+
+def _draw_scale_bar(picture: Image, view: View, ink: Any, panel: Any) -> None:
+    import cv2
+
+    assert view.px_per_m is not None
+    text_px, margin = _sizes(view)
+    W, H = view.size
+    length_m = scale_bar_m(view.px_per_m, 0.22 * W)
+    length_px = round(length_m * view.px_per_m)
+    left, right, v = W - margin - length_px, W - margin, H - margin - text_px // 4
+    pad = round(0.6 * text_px)
+    style.draw_panel(picture, (left - pad, v - 2 * text_px - pad // 2, right + pad, v + pad), panel)
+    tick, thick = text_px // 3, max(2, text_px // 7)
+    for a, b in (
+        ((left, v), (right, v)),
+        ((left, v - tick), (left, v + tick)),
+        ((right, v - tick), (right, v + tick)),
+    ):
+        cv2.line(picture, a, b, ink, thick, cv2.LINE_AA)
+    label = f"{length_m:g} m"
+    at = ((left + right - style.text_size(label, text_px)[0]) // 2, v - round(0.6 * text_px))
+    style.draw_text(picture, label, at, text_px, ink)
+
+
+def _draw_ends(picture: Image, scene: Scene, view: View, panel: Any) -> None:
+    """A disc and a word at the first and the last camera."""
+    import cv2
+
+    text_px, _ = _sizes(view)
+    ends = (("end", scene.path_m[-1:], style.END), ("start", scene.path_m[:1], style.START))
+    for word, point, color in ends:
+        uv, depth = view.project(point)
+        u, v = (int(x) for x in np.round(np.clip(uv[0], -1e4, 1e4)))
+        if depth[0] <= 0 or not (0 <= u < view.size[0] and 0 <= v < view.size[1]):
+            continue
+        r = max(4, round(0.42 * text_px))
+        cv2.circle(picture, (u, v), r + max(1, r // 4), panel, -1, cv2.LINE_AA)
+        cv2.circle(picture, (u, v), r, color, -1, cv2.LINE_AA)
+        width = style.text_size(word, text_px, 600)[0]
+        left = int(np.clip(u - width // 2, 2, max(view.size[0] - width - 2, 2)))
+        base = v + r + round(1.25 * text_px)
+        if base + text_px // 3 > view.size[1]:
+            base = v - r - round(0.5 * text_px)
+        pad = text_px // 4
+        style.draw_panel(
+            picture, (left - pad, base - text_px, left + width + pad, base + pad + 1), panel, 0.7
+        )
+        style.draw_text(picture, word, (left, base), text_px, color, 600)

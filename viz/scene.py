@@ -1,0 +1,153 @@
+"""A result as a scene of points, polylines and camera frustums, and the views to look at it from.
+
+Pure geometry in the world of the result (first camera, metres): draws nothing and reads no file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pipelines.geometry import transform_points
+from pipelines.io.result import Result
+from pipelines.types import Array
+from viz import style
+
+STRAY_QUANTILE = 0.95  # of the points' distances to the path: what lies far beyond is stray
+STRAY_FACTOR = 1.6
+N_FRUSTUMS = 20
+FRUSTUM_SHARE = 0.013  # frustum depth as a share of the scene's extent
+GAP_FACTOR = 1.5  # median frame intervals; a longer one breaks the drawn path
+
+
+@dataclass(frozen=True, slots=True)
+class Polyline:
+    """Connected points (N, 3) in metres, drawn `width_px` wide; with a label, in the legend."""
+
+    points_m: Array
+    color: style.Color
+    width_px: float
+    label: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What there is to draw.
+
+    points_m: (N, 3) without stray far points. colors: (N, 3) uint8. path_m: (F, 3) camera centres
+    in order. up: (3,) unit vector. forward: (3,) unit, across up: where the camera looked first.
+    """
+
+    points_m: Array
+    colors: NDArray[np.uint8]
+    path_m: Array
+    polylines: tuple[Polyline, ...]
+    up: Array
+    forward: Array
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A pinhole view of the scene: axes of the view as a camera's, size in pixels (width, height).
+
+    px_per_m: scale of a map seen from above, or None where the scale varies with distance.
+    """
+
+    name: str
+    size: tuple[int, int]
+    K: Array
+    T_view_world: Array
+    px_per_m: float | None = None
+
+    def project(self, points_m: Array) -> tuple[Array, Array]:
+        """Pixels (N, 2) and depths (N,) in metres of world points (N, 3)."""
+        camera = transform_points(self.T_view_world, points_m)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            homogeneous = camera @ self.K.T
+            return homogeneous[:, :2] / homogeneous[:, 2:], camera[:, 2]
+
+
+def build_scene(result: Result, *, keyframe_every: int | None = None) -> Scene:
+    """Scene of a result: map points, the estimated and the true path, and some camera frustums.
+
+    keyframe_every: a frustum at every n-th pose; by default about twenty along the path.
+    """
+    Ts = result.Ts_world_camera
+    path = Ts[:, :3, 3] if len(Ts) else np.zeros((1, 3))
+    up = _up(Ts)
+    keep = near_path(result.static_points_m, path)
+    points, colors = result.static_points_m[keep], result.static_colors[keep]
+    polylines: list[Polyline] = []
+    if result.gt_Ts_world_camera is not None and result.gt_timestamps_s is not None:
+        truth = result.gt_Ts_world_camera[:, :3, 3]
+        polylines += [
+            Polyline(piece, style.TRUTH, 6.0, "ground truth")
+            for piece in split_at_gaps(result.gt_timestamps_s, truth)
+        ]
+    if len(Ts):
+        step = keyframe_every or max(1, round(len(Ts) / N_FRUSTUMS))
+        size_m = FRUSTUM_SHARE * extent_m(path, points)
+        polylines += [Polyline(f, style.FRUSTUM, 1.0) for f in frustums(Ts[::step], size_m)]
+    for piece in split_at_gaps(result.timestamps_s, path[: len(Ts)]):
+        polylines.append(Polyline(piece, style.ESTIMATE, 2.4, "camera, estimated"))
+    return Scene(points, colors, path, tuple(polylines), up, _forward(Ts, up))
+
+
+def near_path(points_m: Array, path_m: Array) -> NDArray[np.bool_]:
+    """Which points (N, 3) are no strays: finite, and not far beyond what most of the map spans."""
+    finite = np.isfinite(points_m).all(1)
+    if not finite.any():
+        return finite
+    distance = np.full(len(points_m), np.inf)
+    distance[finite] = cKDTree(path_m).query(points_m[finite])[0]
+    return distance <= STRAY_FACTOR * np.quantile(distance[finite], STRAY_QUANTILE)
+
+
+def split_at_gaps(timestamps_s: Array, points_m: Array) -> list[Array]:
+    """The path (N, 3) in pieces that end where frames are missing in time."""
+    if len(points_m) < 2:
+        return [points_m] if len(points_m) else []
+    steps_s = np.diff(timestamps_s)
+    breaks = np.flatnonzero(steps_s > GAP_FACTOR * np.median(steps_s)) + 1
+    return np.split(points_m, breaks)
+
+
+def frustums(Ts_world_camera: Array, size_m: float) -> list[Array]:
+    """Closed outlines (K of (8, 3)) of small pyramids that open the way the cameras look."""
+    x, y, z = 0.62 * size_m, 0.4 * size_m, size_m
+    corners = np.array([[-x, -y, z], [x, -y, z], [x, y, z], [-x, y, z]])
+    apex = np.zeros(3)
+    order = [apex, *corners, corners[0], apex, corners[1], corners[2], apex, corners[3]]
+    outline = np.array(order)
+    return [transform_points(T, outline) for T in Ts_world_camera]
+
+
+def extent_m(path_m: Array, points_m: Array) -> float:
+    """Diagonal of the box around the path and the middle 90 % of the points; at least 0.1 m."""
+    lows, highs = [path_m.min(0)], [path_m.max(0)]
+    if len(points_m):
+        low, high = np.quantile(points_m, [0.05, 0.95], axis=0)
+        lows.append(low)
+        highs.append(high)
+    return max(float(np.linalg.norm(np.max(highs, 0) - np.min(lows, 0))), 0.1)
+
+
+def _up(Ts: Array) -> Array:
+    """Mean upward axis of the cameras: tilts average out over a path, so it is near the true up."""
+    up = -Ts[:, :3, 1].sum(0) if len(Ts) else np.array([0.0, -1.0, 0.0])
+    length = np.linalg.norm(up)
+    return up / length if length > 1e-6 else np.array([0.0, -1.0, 0.0])
+
+
+def _forward(Ts: Array, up: Array) -> Array:
+    """Viewing direction of the first camera, made horizontal."""
+    forward = Ts[0, :3, 2] if len(Ts) else np.array([0.0, 0.0, 1.0])
+    forward = forward - up * (forward @ up)
+    length = np.linalg.norm(forward)
+    if length < 1e-6:  # the camera looks straight up or down
+        forward = np.cross(up, Ts[0, :3, 0] if len(Ts) else np.array([1.0, 0.0, 0.0]))
+        length = max(float(np.linalg.norm(forward)), 1e-9)
+    return forward / length

@@ -1,0 +1,97 @@
+"""How things look: colours that colour-blind eyes can tell apart, type, and marks on images.
+
+Owns the palette (Okabe and Ito 2008) and drawing of text. Colours are (R, G, B) uint8 values and
+images (H, W, 3) uint8 RGB, drawn on in place by the functions named `draw_`.
+"""
+
+from __future__ import annotations
+
+import colorsys
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from pipelines.types import Image
+
+Color = tuple[int, int, int]
+
+WHITE: Color = (255, 255, 255)
+INK: Color = (38, 38, 42)
+GREY: Color = (150, 150, 150)
+
+ESTIMATE: Color = (0, 100, 190)  # blue: the camera as estimated
+TRUTH: Color = (245, 178, 66)  # amber, drawn wide beneath the estimate: the camera as it was
+FRUSTUM: Color = (90, 160, 220)
+START: Color = (0, 140, 100)
+END: Color = (170, 50, 120)
+
+INLIER: Color = (60, 235, 150)
+OUTLIER: Color = (255, 70, 60)
+UNTRACKED: Color = (165, 165, 170)
+STATUS_OK: Color = (0, 135, 95)
+STATUS_LOST: Color = (205, 50, 30)
+
+OBJECT_COLORS: tuple[Color, ...] = (
+    (230, 159, 0),
+    (86, 180, 233),
+    (204, 121, 167),
+    (240, 228, 66),
+    (213, 94, 0),
+    (0, 158, 115),
+    (120, 110, 220),
+    (170, 220, 90),
+)
+BACKGROUNDS: dict[str, Color] = {"white": WHITE, "black": (16, 18, 22)}
+
+
+def object_color(object_id: int) -> Color:
+    """The colour of an object, the same in every picture and run: it depends on its id alone."""
+    base = OBJECT_COLORS[(object_id - 1) % len(OBJECT_COLORS)]
+    turn = (object_id - 1) // len(OBJECT_COLORS)
+    if turn == 0:
+        return base
+    # Past the palette's end the hues are taken again, darker by steps and slightly turned.
+    hue, lightness, saturation = colorsys.rgb_to_hls(*(channel / 255.0 for channel in base))
+    lightness *= (0.72, 0.88, 0.58)[(turn - 1) % 3]
+    red, green, blue = colorsys.hls_to_rgb((hue + 0.033 * turn) % 1.0, lightness, saturation)
+    return round(255 * red), round(255 * green), round(255 * blue)
+
+
+@cache
+def _font() -> Any:
+    import cv2
+
+    return cv2.FontFace("sans")
+
+
+def text_size(text: str, size_px: int, weight: int = 400) -> tuple[int, int]:
+    """Width and height in pixels that `text` takes."""
+    import cv2
+
+    _, _, width, _ = cv2.getTextSize((8192, 512), text, (0, 0), _font(), size_px, weight=weight)
+    return int(width), int(size_px)
+
+
+def draw_text(
+    image: Image,
+    text: str,
+    at: tuple[int, int],
+    size_px: int = 16,
+    color: Color = INK,
+    weight: int = 400,
+) -> None:
+    """Write `text` with its baseline starting at pixel `at` (u, v)."""
+    import cv2
+
+    cv2.putText(image, text, at, color, _font(), size_px, weight=weight)
+
+
+def draw_panel(
+    image: Image, box: tuple[int, int, int, int], color: Color = WHITE, opacity: float = 0.85
+) -> None:
+    """Blend a plain rectangle (u0, v0, u1, v1), the ends not included, over the image."""
+    H, W = image.shape[:2]
+    u0, v0, u1, v1 = max(box[0], 0), max(box[1], 0), min(box[2], W), min(box[3], H)
+    under = image[v0:v1, u0:u1].astype(np.float32)
+    image[v0:v1, u0:u1] = np.round(under + opacity * (np.array(color, np.float32) - under))
