@@ -116,8 +116,7 @@ def _packages(environment: Environment) -> Iterator[Finding]:
             yield Finding(Verdict.NOTE, f"packages: {section}", words)
     if not has_venv_module():
         name = f"python{sys.version_info.major}.{sys.version_info.minor}-venv"
-        command = system_libraries.install_command([name])
-        words = f"this Python cannot make virtual environments; on Debian type: {command}"
+        words = f"this Python cannot make virtual environments{_remedy([name])}"
         yield Finding(_if_missing(), "venv", words)
 
 
@@ -129,16 +128,14 @@ def _lacking(pin: str, found: str) -> str:
 def _libraries() -> Iterator[Finding]:
     required, rendering = system_libraries.missing_required(), system_libraries.missing_rendering()
     if required:
-        command = system_libraries.install_command(list(required.values()))
-        words = f"missing {', '.join(required)}; on Debian type: {command}"
+        words = f"missing {', '.join(required)}{_remedy(list(required.values()))}"
         yield Finding(_if_missing(), "system libraries", words)
     else:
         yield Finding(Verdict.OK, "system libraries", ", ".join(system_libraries.REQUIRED))
     if rendering:
-        command = system_libraries.install_command(list(rendering.values()))
         words = (
-            f"missing {' and '.join(rendering)}, so pictures are drawn by plain software "
-            f"splatting; for better ones, on Debian, type: {command}"
+            f"missing {' and '.join(rendering)}: pictures are drawn by plain software splatting"
+            f"{_remedy(list(rendering.values()))}"
         )
         yield Finding(Verdict.NOTE, "Vulkan", words)
     else:
@@ -146,10 +143,19 @@ def _libraries() -> Iterator[Finding]:
         yield Finding(Verdict.OK, "Vulkan", f"drivers: {drivers}")
 
 
+def _set_up_installs() -> bool:
+    return system_libraries.can_install() and os.environ.get("DYOB_NO_SETUP") != "1"
+
+
 def _if_missing() -> Verdict:
     """What the set-up will install by itself is only a note."""
-    set_up_is_off = os.environ.get("DYOB_NO_SETUP") == "1"
-    return Verdict.NOTE if system_libraries.can_install() and not set_up_is_off else Verdict.UNFIT
+    return Verdict.NOTE if _set_up_installs() else Verdict.UNFIT
+
+
+def _remedy(packages: Sequence[str]) -> str:
+    if _set_up_installs():
+        return f"; the set-up installs {', '.join(packages)}"
+    return f"; on Debian type: {system_libraries.install_command(packages)}"
 
 
 def _can_import(names: Sequence[str]) -> bool:

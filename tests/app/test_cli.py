@@ -130,3 +130,12 @@ def test_a_verb_runs_in_a_process_of_its_own(repository: Path) -> None:
     )
     assert done.returncode == 2
     assert done.stderr.startswith("dyob-slam: orb.n_features: expected a whole number")
+
+
+def test_render_offers_what_the_renderer_can_draw() -> None:
+    from viz.style import BACKGROUNDS
+    from viz.views import VIEW_NAMES
+
+    assert cli.VIEWS == VIEW_NAMES
+    for background in BACKGROUNDS:
+        cli.build_parser().parse_args(["render", "--background", background])

@@ -1,0 +1,116 @@
+"""Each verb in a process of its own, on a few simulated frames; its files re-read by evo."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("pipelines.run")
+ROOT = Path(__file__).resolve().parents[2]
+ENVIRONMENT = {**os.environ, "DYOB_NO_SETUP": "1"}
+N_FRAMES = 5
+
+
+def app(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "app", *map(str, words)]
+    return subprocess.run(
+        command, cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory) -> Path:
+    """The folder of one short run."""
+    output = tmp_path_factory.mktemp("results")
+    done = app("run", "simulated:demo", "--frames", N_FRAMES, "--output", output, "--quiet")
+    assert done.returncode == 0, done.stdout + done.stderr
+    folder = Path(done.stdout.strip())
+    assert folder == (output / "latest").resolve()
+    return folder
+
+
+def test_run_writes_a_trajectory_that_evo_reads(result: Path) -> None:
+    from evo.tools import file_interface
+
+    trajectory = file_interface.read_tum_trajectory_file(result / "camera_tum.txt")
+    truth = file_interface.read_tum_trajectory_file(result / "camera_gt_tum.txt")
+    assert trajectory.num_poses == truth.num_poses == N_FRAMES
+    assert trajectory.check()[0]
+    assert abs(trajectory.path_length - truth.path_length) < 0.05 * truth.path_length
+
+
+def test_run_counts_what_it_did(result: Path) -> None:
+    counts = json.loads((result / "metrics.json").read_text())["run"]
+    assert (counts["frames"], counts["tracked"], counts["lost"]) == (N_FRAMES, N_FRAMES, 0)
+    assert counts["interrupted"] is False
+
+
+def test_eval_restores_metrics_that_were_lost(result: Path) -> None:
+    before = json.loads((result / "metrics.json").read_text())
+    damaged = {key: value for key, value in before.items() if key != "camera"}
+    (result / "metrics.json").write_text(json.dumps(damaged))
+    done = app("eval", result)
+    assert done.returncode == 0, done.stderr
+    assert "ATE" in done.stdout
+    after = json.loads((result / "metrics.json").read_text())
+    assert after["camera"] == pytest.approx(before["camera"], nan_ok=True)
+
+
+def test_render_draws_pictures_of_the_size_asked_for(result: Path) -> None:
+    import cv2
+
+    done = app("render", result, "--size", "320x200")
+    assert done.returncode == 0, done.stderr
+    files = [Path(line) for line in done.stdout.splitlines() if line.endswith(".png")]
+    assert files
+    for file in files:
+        image = cv2.imread(str(ROOT / file))
+        assert image.shape == (200, 320, 3)
+        assert image.std() > 1.0, f"{file} is empty"
+
+
+def test_ctrl_c_leaves_a_valid_partial_result(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "app", "run", "simulated:demo", "--output", str(tmp_path)]
+    with subprocess.Popen(
+        command, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as running:
+        deadline = time.monotonic() + 120
+        while not (tmp_path / "latest").exists():
+            assert running.poll() is None, "ended before it made a result folder"
+            assert time.monotonic() < deadline, "made no result folder"
+            time.sleep(0.05)
+        time.sleep(1.0)
+        running.send_signal(signal.SIGINT)
+        running.communicate(timeout=120)
+    counts = json.loads((tmp_path / "latest" / "metrics.json").read_text())["run"]
+    if running.returncode == 0:
+        pytest.skip("the run had finished before the signal came")
+    assert running.returncode == 130
+    assert counts["interrupted"] is True
+    lines = (tmp_path / "latest" / "camera_tum.txt").read_text().splitlines()
+    assert len([line for line in lines if line[0] != "#"]) == counts["tracked"]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["run", "no/such/folder"], "no/such/folder"),
+        (["run", "simulated:demo", "--config", "no.yaml"], "cannot read the settings file no.yaml"),
+        (["run", "simulated:demo", "--set", "orb.n_feature=3"], "'orb.n_features'"),
+        (["run", ".", "--dataset", "vd"], "vdo"),
+        (["eval", "no/such/result"], "expected a result folder, found nothing"),
+        (["render", "no/such/result"], "expected a result folder, found nothing"),
+    ],
+)
+def test_bad_input_is_code_2_and_a_sentence(words: list[str], sentence: str) -> None:
+    done = app(*words)
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert sentence in done.stderr
+    assert "Traceback" not in done.stderr
