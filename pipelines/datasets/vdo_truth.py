@@ -36,7 +36,7 @@ def read_object_truth(
     world (rotation vector). Boxes that no file states are those of the masks.
     """
     index_of = {number: i for i, number in enumerate(numbers)}
-    rows = np.empty((0, 10))
+    rows: Array = np.empty((0, 10))
     if (root / "object_pose.txt").is_file():
         rows = read_rows(root / "object_pose.txt", 10, "frame, object id and 8 numbers")
         rows = rows[[int(row[0]) in index_of for row in rows]]

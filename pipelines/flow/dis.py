@@ -56,7 +56,8 @@ class DisFlow:
 
     def _run(self, first: Image, second: Image) -> NDArray[np.float32]:
         first, second = np.ascontiguousarray(first), np.ascontiguousarray(second)
-        return np.ascontiguousarray(self._dis.calc(first, second, None), np.float32)  # type: ignore[call-overload]
+        flow = np.zeros((*first.shape, 2), np.float32)
+        return np.ascontiguousarray(self._dis.calc(first, second, flow), np.float32)
 
 
 def _misses(flow: NDArray[np.float32], back: NDArray[np.float32]) -> NDArray[np.float32]:
