@@ -17,6 +17,7 @@ from pipelines.datasets.simulated.meshes import (
     merge,
     pose,
     quad,
+    quads,
     surface,
 )
 from pipelines.types import Array
@@ -49,8 +50,7 @@ def house(width_m: float, depth_m: float, rng: np.random.Generator, plain: bool 
     uv = _uv(first * BAY_M, (4 - levels) * STOREY_M, bays, levels * STOREY_M)
     parts.append(quad(upper, storeys, tint, uv))
     for x, z0, z1 in ((0.0, d, 0.0), (w, 0.0, d)):
-        side = [(x, eaves, z0), (x, eaves, z1), (x, 0, z1), (x, 0, z0)]
-        parts.append(quad(side, wall, tint))
+        parts += _side_wall(x, (z0, z1), levels, (wall, storeys, tint))
     parts.append(box((w, 0.35, 0.5), "plain", (206, 200, 188), (w / 2, eaves - 0.1, -0.12)))
     parts.append(box((w, 0.2, 0.24), "plain", (196, 190, 178), (w / 2, -GROUND_M + 0.02, -0.06)))
     parts += _roof(w, d, eaves, wall, tint, rng)
@@ -59,6 +59,25 @@ def house(width_m: float, depth_m: float, rng: np.random.Generator, plain: bool 
     if wall == "plaster" and levels > 2:
         parts += _balconies(w, levels, rng)
     return merge(parts)
+
+
+def _side_wall(
+    x: float, z: tuple[float, float], levels: int, style: tuple[str, str, tuple[int, ...]]
+) -> list[Mesh]:
+    """Wall without a shop; two window bays in its middle are seen where a side street opens."""
+    wall, storeys, tint = style
+    eaves, (z0, z1) = -(GROUND_M + levels * STOREY_M), z
+    edges = np.interp([0, 0.15, 0.85, 1], [0, 1], [z0, z1])
+    parts = []
+    for k in range(3):
+        a, b = edges[k], edges[k + 1]
+        top = eaves if k != 1 else -GROUND_M
+        parts.append(quad([(x, top, a), (x, top, b), (x, 0, b), (x, 0, a)], wall, tint))
+    a, b = edges[1], edges[2]
+    upper = [(x, eaves, a), (x, eaves, b), (x, -GROUND_M, b), (x, -GROUND_M, a)]
+    uv = _uv(BAY_M, (4 - levels) * STOREY_M, 2 * BAY_M, levels * STOREY_M)
+    parts.append(quad(upper, storeys, tint, uv))
+    return parts
 
 
 def _uv(u: float, v: float, width: float, height: float) -> list[tuple[float, float]]:
@@ -123,9 +142,7 @@ def tree(rng: np.random.Generator, height_m: float = 6.5) -> Mesh:
         angle = k * 2 * np.pi / 5 + rng.uniform(-0.3, 0.3)
         reach = rng.uniform(0.7, 1.15)
         tip = np.array([reach * np.cos(angle), top * rng.uniform(0.6, 0.84), reach * np.sin(angle)])
-        parts.append(
-            cylinder((0, top * 0.42, 0), tip, (0.07, 0.03), "bark", sides=6, caps=False)
-        )
+        parts.append(cylinder((0, top * 0.42, 0), tip, (0.07, 0.03), "bark", sides=6, caps=False))
         centres.append(tip)
     green = np.array((255, 255, 255)) * rng.uniform(0.82, 1.0) * (1.0, rng.uniform(0.92, 1), 0.95)
     for centre in centres:
@@ -148,15 +165,11 @@ def _sprays(centre: Array, radius: float, tint: Array, rng: np.random.Generator)
     a /= np.linalg.norm(a, axis=1, keepdims=True)
     b /= np.linalg.norm(b, axis=1, keepdims=True)
     half = rng.uniform(0.14, 0.3, (n, 1))
-    u0 = rng.uniform(0, 1.6, (n, 2))
-    parts = []
-    for i in range(n):
-        m, p, q = middle[i], a[i] * half[i], b[i] * half[i]
-        uv = u0[i] + half[i] * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-        spray = quad([m - p, m - q, m + p, m + q], "foliage", tint, uv)
-        spray.normals[:] = out[i] / np.linalg.norm(out[i])
-        parts.append(spray)
-    return merge(parts)
+    p, q = a * half, b * half
+    corners = np.stack([middle - p, middle - q, middle + p, middle + q], 1)
+    around = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    uv = rng.uniform(0, 1.6, (n, 1, 2)) + half[:, None] * around
+    return quads(corners, "foliage", tint, uv, normals=out)
 
 
 def lamp_post() -> Mesh:
@@ -172,16 +185,20 @@ def lamp_post() -> Mesh:
 
 def road_sign(kind: str) -> Mesh:
     """Sign on a post, 2.4 m, its face towards -z: `limit`, `parking` or `crossing`."""
-    post = cylinder((0, 0, 0.03), (0, -2.6, 0.03), (0.035, 0.035), "plain", (150, 152, 154), 8, False)
+    post = cylinder(
+        (0, 0, 0.03), (0, -2.6, 0.03), (0.035, 0.035), "plain", (150, 152, 154), 8, False
+    )
     if kind == "limit":
         angle = np.linspace(0, 2 * np.pi, 25)
         rim = np.stack([0.34 * np.cos(angle), -2.4 + 0.34 * np.sin(angle), 0 * angle], 1)
         points = np.stack([np.broadcast_to((0, -2.4, 0), rim.shape), rim])
         uv = points[..., :2] - (0, -2.4) + 0.35
-        return merge([post, surface(points, "sign_limit", uv=uv)])
+        back = surface(points + (0, 0, 0.012), "plain", (150, 152, 154))
+        return merge([post, surface(points, "sign_limit", uv=uv), back])
     face = [(-0.33, -2.73, 0), (0.33, -2.73, 0), (0.33, -2.07, 0), (-0.33, -2.07, 0)]
     uv = [(0.01, 0.01), (0.69, 0.01), (0.69, 0.69), (0.01, 0.69)]
-    return merge([post, quad(face, f"sign_{kind}", WHITE, uv)])
+    back = quad(np.array(face) + (0, 0, 0.012), "plain", (150, 152, 154))
+    return merge([post, quad(face, f"sign_{kind}", WHITE, uv), back])
 
 
 def traffic_light() -> Mesh:
@@ -195,7 +212,9 @@ def traffic_light() -> Mesh:
 
 def bench() -> Mesh:
     """Wooden bench along x, 1.7 m, its back towards +z."""
-    slats = [box((1.7, 0.04, 0.1), "wood", (172, 116, 72), (0, -0.45, z)) for z in (-0.2, -0.06, 0.08)]
+    slats = [
+        box((1.7, 0.04, 0.1), "wood", (172, 116, 72), (0, -0.45, z)) for z in (-0.2, -0.06, 0.08)
+    ]
     slats += [box((1.7, 0.1, 0.04), "wood", (172, 116, 72), (0, y, 0.2)) for y in (-0.62, -0.8)]
     legs = [box((0.07, 0.85, 0.45), "plain", (52, 54, 56), (x, -0.42, 0.02)) for x in (-0.7, 0.7)]
     return merge([*slats, *legs])
@@ -203,7 +222,9 @@ def bench() -> Mesh:
 
 def litter_bin() -> Mesh:
     body = cylinder((0, 0, 0), (0, -0.85, 0), (0.22, 0.25), "plain", (58, 88, 66), 12)
-    return merge([body, cylinder((0, -0.85, 0), (0, -0.9, 0), (0.27, 0.27), "plain", (44, 52, 48), 12)])
+    return merge(
+        [body, cylinder((0, -0.85, 0), (0, -0.9, 0), (0.27, 0.27), "plain", (44, 52, 48), 12)]
+    )
 
 
 def planter(rng: np.random.Generator) -> Mesh:

@@ -20,7 +20,9 @@ _BAYS = 4
 _STOREYS = 4
 
 
-def _glass(canvas: Canvas, box: tuple[float, float, float, float], rng: np.random.Generator) -> None:
+def _glass(
+    canvas: Canvas, box: tuple[float, float, float, float], rng: np.random.Generator
+) -> None:
     """Window glass with sky in it and, often, a curtain or a blind behind."""
     x0, y0, x1, y1 = box
     sky = rng.uniform(0.55, 1.0)
@@ -34,7 +36,9 @@ def _glass(canvas: Canvas, box: tuple[float, float, float, float], rng: np.rando
             start = a if a == x0 else inner
             canvas.polygon([(a, y0), (b, y0), (edge, y1), (start, y1)], cloth * 0.86)
             for fold in np.linspace(a, b, 5)[1:-1]:
-                canvas.line([(fold, y0), (fold * 0.7 + (start + edge) * 0.15, y1)], cloth * 0.7, 0.02)
+                canvas.line(
+                    [(fold, y0), (fold * 0.7 + (start + edge) * 0.15, y1)], cloth * 0.7, 0.02
+                )
     elif kind == 2:  # a roller blind
         y = y0 + (y1 - y0) * rng.uniform(0.2, 0.7)
         canvas.rect(x0, y0, x1, y, (206, 200, 184))
@@ -44,7 +48,7 @@ def _glass(canvas: Canvas, box: tuple[float, float, float, float], rng: np.rando
             canvas.ellipse((x, y1 - 0.12), (0.09, 0.14), (52, 82, 44))
             canvas.rect(x - 0.06, y1 - 0.08, x + 0.06, y1, (150, 84, 56))
     glint = x0 + (x1 - x0) * rng.uniform(0.1, 0.5)
-    canvas.line([(glint, y1 - 0.1), (glint + 0.3 * (x1 - x0), y0 + 0.1)], (172, 188, 198), 0.03)
+    canvas.line([(glint, y1 - 0.1), (glint + 0.3 * (x1 - x0), y0 + 0.1)], (150, 166, 178), 0.02)
 
 
 def _window(canvas: Canvas, x: float, y: float, style: int, rng: np.random.Generator) -> None:
@@ -106,7 +110,14 @@ _SHOPS = (
     ("RECORDS", (46, 42, 46), (230, 190, 80)),
     ("GREENGROCER", (64, 96, 52), (244, 240, 220)),
 )
-_GOODS = ((176, 74, 52), (206, 164, 74), (92, 116, 66), (196, 186, 166), (84, 92, 130), (150, 96, 60))
+_GOODS = (
+    (176, 74, 52),
+    (206, 164, 74),
+    (92, 116, 66),
+    (196, 186, 166),
+    (84, 92, 130),
+    (150, 96, 60),
+)
 
 
 def _shop(canvas: Canvas, x: float, w: float, which: int, rng: np.random.Generator) -> None:
@@ -128,7 +139,7 @@ def _shop(canvas: Canvas, x: float, w: float, which: int, rng: np.random.Generat
             at += width + rng.uniform(0.03, 0.18)
         canvas.rect(x + 0.18, shelf, door_x - 0.12, shelf + 0.06, (118, 98, 76))
     glint = [(x + 0.5, 3.1), (x + 1.3, 1.15)]
-    canvas.line(glint, (128, 140, 148), 0.05)
+    canvas.line(glint, (98, 108, 116), 0.03)
     middle = (x + 0.18 + door_x - 0.12) / 2
     canvas.rect(middle - 0.04, 1.1, middle + 0.04, 3.15, paint)
     canvas.rect(x + 0.1, 3.2, door_x - 0.1, 3.66, dark)  # the plinth below

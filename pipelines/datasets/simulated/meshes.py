@@ -131,16 +131,53 @@ def _smooth_normals(vertices: Array, triangles: NDArray[np.int64], cross: Array)
     return total[same]
 
 
+def quads(
+    corners: ArrayLike,
+    texture: str,
+    tint: ArrayLike = WHITE,
+    uv: ArrayLike | None = None,
+    normals: ArrayLike | None = None,
+) -> Mesh:
+    """Flat four-cornered pieces (N, 4, 3); corners go around from the top left.
+
+    uv: (N, 4, 2) metres; unrolled by the lengths of the upper and right sides where not given.
+    normals: (N, 3) to shade with in place of the pieces' own.
+    """
+    p = np.asarray(corners, float)
+    N = len(p)
+    if uv is None:
+        w = np.linalg.norm(p[:, 1] - p[:, 0], axis=1)
+        h = np.linalg.norm(p[:, 2] - p[:, 1], axis=1)
+        o = np.zeros(N)
+        uv = np.stack([o, o, w, o, w, h, o, h], 1).reshape(N, 4, 2)
+    which = np.array([(0, 1, 2), (0, 2, 3)])
+    triangles = (np.arange(N)[:, None, None] * 4 + which).reshape(-1, 3)
+    flat = p.reshape(-1, 3)
+    a, b, c = (flat[triangles[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    length = np.linalg.norm(cross, axis=1)
+    shading = cross if normals is None else np.repeat(np.asarray(normals, float), 2, 0)
+    keep = length > 1e-9
+    triangles, shading = triangles[keep], shading[keep]
+    shading = shading / np.linalg.norm(shading, axis=1, keepdims=True)
+    M = len(triangles)
+    return Mesh(
+        flat,
+        triangles,
+        np.asarray(uv, float).reshape(-1, 2)[triangles],
+        np.repeat(shading[:, None], 3, 1),
+        np.full(M, texture),
+        np.tile(np.asarray(tint, float), (M, 1)),
+        np.zeros(M, bool),
+    )
+
+
 def quad(
     corners: ArrayLike, texture: str, tint: ArrayLike = WHITE, uv: ArrayLike | None = None
 ) -> Mesh:
-    """Flat four-cornered piece; corners in the order top left, top right, bottom right, left."""
-    a, b, c, d = np.asarray(corners, float)
-    grid_uv = None
-    if uv is not None:
-        ua, ub, uc, ud = np.asarray(uv, float)
-        grid_uv = np.array([[ua, ub], [ud, uc]])
-    return surface(np.array([[a, b], [d, c]]), texture, tint, grid_uv)
+    """One piece of `quads`: corners (4, 3), texture coordinates (4, 2)."""
+    grid_uv = None if uv is None else np.asarray(uv, float)[None]
+    return quads(np.asarray(corners, float)[None], texture, tint, grid_uv)
 
 
 def box(
@@ -148,14 +185,17 @@ def box(
 ) -> Mesh:
     """Box of `size` (x, y, z) in metres around `centre`, each face textured upright."""
     x, y, z = np.asarray(size, float) / 2
-    front = [(-x, -y, -z), (x, -y, -z), (x, y, -z), (-x, y, -z)]
-    back = [(x, -y, z), (-x, -y, z), (-x, y, z), (x, y, z)]
-    left = [(-x, -y, z), (-x, -y, -z), (-x, y, -z), (-x, y, z)]
-    right = [(x, -y, -z), (x, -y, z), (x, y, z), (x, y, -z)]
-    top = [(-x, -y, z), (x, -y, z), (x, -y, -z), (-x, -y, -z)]
-    bottom = [(-x, y, -z), (x, y, -z), (x, y, z), (-x, y, z)]
-    faces = np.array([front, back, left, right, top, bottom]) + np.asarray(centre, float)
-    return merge(quad(face, texture, tint) for face in faces)
+    faces = np.array(
+        [
+            [(-x, -y, -z), (x, -y, -z), (x, y, -z), (-x, y, -z)],
+            [(x, -y, z), (-x, -y, z), (-x, y, z), (x, y, z)],
+            [(-x, -y, z), (-x, -y, -z), (-x, y, -z), (-x, y, z)],
+            [(x, -y, -z), (x, -y, z), (x, y, z), (x, y, -z)],
+            [(-x, -y, z), (x, -y, z), (x, -y, -z), (-x, -y, -z)],
+            [(-x, y, -z), (x, y, -z), (x, y, z), (-x, y, z)],
+        ]
+    )
+    return quads(faces + np.asarray(centre, float), texture, tint)
 
 
 def cylinder(
@@ -175,7 +215,9 @@ def cylinder(
     if caps:
         for centre, radius in ((a, radii[0]), (b, radii[1])):
             rim = centre + radius * across
-            parts.append(surface(np.stack([np.broadcast_to(centre, rim.shape), rim]), texture, tint))
+            parts.append(
+                surface(np.stack([np.broadcast_to(centre, rim.shape), rim]), texture, tint)
+            )
     return merge(parts)
 
 

@@ -62,8 +62,8 @@ class TriangleTable:
         )
 
     def smooth_normals(self, triangle: NDArray[np.int32], points: Floats) -> Floats:
-        """Unit normals (N, 3) between the corner normals, at points (N, 3) on triangles (N,)."""
-        offset = points - self.corner.astype(np.float32)[triangle]
+        """Unit normals (N, 3) between the corner normals, at points (3, N) on triangles (N,)."""
+        offset = points.T - self.corner.astype(np.float32)[triangle]
         weights = np.einsum("nki,ni->nk", self.dual[triangle], offset)
         corners = self.corner_normals[triangle]
         normal = corners[:, 0] * (1 - weights.sum(1, keepdims=True))
@@ -76,44 +76,51 @@ class ViewTable:
     """What a camera sees of a `TriangleTable`: linear functions of the pixel, for each triangle.
 
     tiles0: (2, M) texture coordinates at the camera's centre. G: (3, 2, M) their change along the
-    ray for [d0, du, dv]. nd: (3, M) the plane's normal times [d0, du, dv].
+    ray for [d0, du, dv]. nd: (3, M) the plane's normal times [d0, du, dv]. side: (M,) +1 where
+    the camera is on the side that `corner_normals` point to, else -1.
     """
 
     tiles0: Floats
     G: Floats
     nd: Floats
+    side: Floats
 
     @classmethod
     def of(cls, table: TriangleTable, origin: Array, rays: Array) -> ViewTable:
         """View from `origin` (3,) with ray directions d0 + u du + v dv, `rays` (3, 3) as rows."""
-        offset = np.einsum("mij,mj->mi", table.gradient_tiles, origin - table.corner)
+        from_corner = origin - table.corner
+        offset = np.einsum("mij,mj->mi", table.gradient_tiles, from_corner)
         tiles0 = table.corner_tiles + offset
         # The whole part changes nothing in a tiled texture, and costs float32 its precision.
         tiles0 -= np.floor(tiles0)
         G = np.einsum("kj,mij->kim", rays, table.gradient_tiles)
         nd = rays @ table.normal.T
-        return cls(_contiguous(tiles0.T), _contiguous(G), _contiguous(nd))
+        shading = table.corner_normals.sum(1)
+        side = np.sign((from_corner * table.normal).sum(1)) * np.sign(
+            (shading * table.normal).sum(1)
+        )
+        return cls(_contiguous(tiles0.T), _contiguous(G), _contiguous(nd), _contiguous(side))
 
     def texture_at(
         self, triangle: NDArray[np.int32], t: Floats, u: Floats, v: Floats
-    ) -> tuple[Floats, Floats, Floats, Floats]:
-        """Texture coordinates (2, N) in tiles, their change per pixel (2, N) right and down, n.d.
+    ) -> tuple[Floats, Floats, Floats]:
+        """Texture coordinates (2, N) in tiles and their change per pixel (2, N) right and down.
 
         triangle, t, u, v: (N,) hits: triangle, distance along the ray, and pixel.
         """
         nd_u, nd_v = self.nd[1][triangle], self.nd[2][triangle]
         nd = self.nd[0][triangle] + u * nd_u + v * nd_v
-        nd_safe = np.where(np.abs(nd) < 1e-9, np.float32(1e-9), nd)
-        qu, qv = nd_u / nd_safe, nd_v / nd_safe
+        nd[np.abs(nd) < 1e-9] = 1e-9
+        shrink_u, shrink_v = t * nd_u / nd, t * nd_v / nd
         tiles = np.empty((2, len(t)), np.float32)
         right, down = np.empty_like(tiles), np.empty_like(tiles)
         for axis in range(2):
             Gu, Gv = self.G[1, axis][triangle], self.G[2, axis][triangle]
             Gd = self.G[0, axis][triangle] + u * Gu + v * Gv
             tiles[axis] = self.tiles0[axis][triangle] + t * Gd
-            right[axis] = t * (Gu - Gd * qu)
-            down[axis] = t * (Gv - Gd * qv)
-        return tiles, right, down, nd
+            right[axis] = t * Gu - Gd * shrink_u
+            down[axis] = t * Gv - Gd * shrink_v
+        return tiles, right, down
 
 
 def _contiguous(array: Array) -> Floats:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +22,8 @@ from pipelines.geometry import invert_T, make_T
 from pipelines.types import Array, Image
 
 _TAPS = 4  # look-ups along the long side of a pixel's footprint
-_EDGE_CONTRAST = 14  # grey levels between neighbours of different geometry that earn more rays
+_EDGE_CONTRAST = 20  # grey levels between neighbours of different geometry that earn more rays
+_HAZE = np.float32((204, 214, 222))
 _SUB_PIXELS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
 
 
@@ -57,23 +59,34 @@ class _Samples:
 
 @dataclass(frozen=True, slots=True)
 class _Body:
-    """A mesh ready for rays: Open3D's scene and the shading table."""
+    """A mesh ready for rays: Open3D's scene, the shading table, and the corners of its box."""
 
     scene: Any
     table: TriangleTable
+    low: Array
+    high: Array
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Placed:
-    """A body in front of one camera: T_camera_body's ray form. owner: see `_Samples`."""
+    """A body in front of one camera, whose rays are written in the body's frame.
+
+    owner: see `_Samples`. facing, up: (M,) light on the triangles of a body that is shaded flat.
+    """
 
     body: _Body
     owner: int
     origin: Array
     rays: Array
-    view: ViewTable
     R_scene_body: Array
     window: tuple[slice, slice]
+    _view: ViewTable | None = None
+
+    @property
+    def view(self) -> ViewTable:
+        if self._view is None:  # most bodies in the window turn out hidden
+            self._view = ViewTable.of(self.body.table, self.origin, self.rays)
+        return self._view
 
 
 class Renderer:
@@ -108,7 +121,8 @@ class Renderer:
                 o3d.core.Tensor(mesh.triangles.astype(np.uint32)),
             )
             shared[id(mesh.vertices)] = scene
-        return _Body(scene, TriangleTable.of(mesh, self._names, self._atlas.tile_m))
+        table = TriangleTable.of(mesh, self._names, self._atlas.tile_m)
+        return _Body(scene, table, *mesh.bounds())
 
     def render(self, index: int, right: bool = False) -> View:
         """Frame `index` from the left camera, or from the right one of the stereo pair."""
@@ -140,11 +154,11 @@ class Renderer:
         H, W = self.world.camera.height, self.world.camera.width
         whole = (slice(0, H), slice(0, W))
         placed = [self._place(self._static, 0, T_scene_camera, np.eye(4), whole)]
-        for i, actor in enumerate(self.world.actors):
+        for i, (actor, body) in enumerate(zip(self.world.actors, self._actors, strict=True)):
             T = actor.Ts_scene_object[index]
-            window = self._window(_box_corners(*actor.mesh.bounds()), T_scene_camera, T)
+            window = self._window(_box_corners(body.low, body.high), T_scene_camera, T)
             if window is not None:
-                placed.append(self._place(self._actors[i], i + 1, T_scene_camera, T, window))
+                placed.append(self._place(body, i + 1, T_scene_camera, T, window))
         return placed
 
     def _place(
@@ -155,9 +169,7 @@ class Renderer:
         K_inverse = np.linalg.inv(camera.K)
         # Rows d0, du, dv: the ray of pixel (u, v) is d0 + u du + v dv, of unit depth.
         rays = (T_body_camera[:3, :3] @ K_inverse)[:, [2, 0, 1]].T
-        origin = T_body_camera[:3, 3]
-        view = ViewTable.of(body.table, origin, rays)
-        return _Placed(body, owner, origin, rays, view, T[:3, :3], window)
+        return _Placed(body, owner, T_body_camera[:3, 3], rays, T[:3, :3], window)
 
     def _window(
         self, corners: Array, T_scene_camera: Array, T: Array
@@ -166,13 +178,13 @@ class Renderer:
         camera = self.world.camera
         T_camera_body = invert_T(T_scene_camera) @ T
         p = corners @ T_camera_body[:3, :3].T + T_camera_body[:3, 3]
-        z = p[:, 2]
-        if z.max() < 0.05 or z.min() > self.world.reach_m:
+        if p[:, 2].min() > self.world.reach_m:
             return None
-        if z.min() < 0.05:  # it reaches behind the camera: projecting corners says nothing
-            return slice(0, camera.height), slice(0, camera.width)
-        u = camera.fx * p[:, 0] / z + camera.cx
-        v = camera.fy * p[:, 1] / z + camera.cy
+        p = _in_front_of(p, 0.05)
+        if not len(p):
+            return None
+        u = camera.fx * p[:, 0] / p[:, 2] + camera.cx
+        v = camera.fy * p[:, 1] / p[:, 2] + camera.cy
         left, top = max(int(u.min()) - 1, 0), max(int(v.min()) - 1, 0)
         right, bottom = min(int(u.max()) + 3, camera.width), min(int(v.max()) + 3, camera.height)
         if left >= right or top >= bottom:
@@ -200,16 +212,17 @@ class Renderer:
     ) -> Image:
         H, W = image.shape[:2]
         part = samples.triangle.reshape(H, W) + samples.owner.reshape(H, W) * 1_000_003
-        signed = image.astype(np.int16)
         edge = np.zeros((H, W), bool)
         for a, b in (((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
                      ((slice(1, None),), (slice(None, -1),))):  # fmt: skip
-            other = part[a] != part[b]
-            other &= np.abs(signed[a] - signed[b]).max(-1) > _EDGE_CONTRAST
+            step = cv2.absdiff(image[a], image[b])
+            contrast = np.maximum(np.maximum(step[..., 0], step[..., 1]), step[..., 2])
+            other = (part[a] != part[b]) & (contrast > _EDGE_CONTRAST)
             edge[a] |= other
             edge[b] |= other
         rows, columns = np.nonzero(edge)
         n = len(rows)
+        self.n_edges = n
         if not n:
             return image
         slots = np.full((H, W), -1, np.int32)
@@ -224,7 +237,7 @@ class Renderer:
     def _shade(self, samples: _Samples, placed: list[_Placed], index: int) -> Floats:
         """Colours (S, 3) 0-255 of samples."""
         colour = np.empty((len(samples.u), 3), np.float32)
-        hit = np.isfinite(samples.t)
+        hit = samples.triangle >= 0
         still = np.flatnonzero((samples.owner == 0) & hit)
         item = placed[0]
         points = _along(item, samples.u[still], samples.v[still], samples.t[still])
@@ -242,9 +255,6 @@ class Renderer:
                 colour[mine] = self._lit_colour(item, samples, mine, shade, full)
         if not hit.all():
             colour[~hit] = self._sky(placed[0], samples.u[~hit], samples.v[~hit])
-        if self.world.light.haze_m is not None and self.world.sky:
-            clear = np.exp(-samples.t[hit] / np.float32(self.world.light.haze_m))[:, None]
-            colour[hit] = colour[hit] * clear + np.float32((204, 214, 222)) * (1 - clear)
         return colour
 
     def _darken_under_actors(
@@ -260,23 +270,30 @@ class Renderer:
         T_scene_camera = self.world.Ts_scene_camera[index]
         position = np.full(len(samples.u), -1, np.int64)
         position[still] = np.arange(len(still))
-        for actor in self.world.actors:
-            window, size = self._patch_window(actor, T_scene_camera, index)
+        for actor, body in zip(self.world.actors, self._actors, strict=True):
+            window, size = self._patch_window(actor, body, T_scene_camera, index)
             if window is None:
                 continue
             where = position[samples.in_window(window)]
             where = where[where >= 0]
             if len(where):
                 T = actor.Ts_scene_object[index]
-                lamp, around = patch_under(points[where], _upright(T), size, self.world.light)
+                x, y, z = (axis[where] for axis in points)
+                reach = np.float32(np.hypot(size[0], size[2]) / 2 + 0.6 + size[1])
+                close = (np.abs(x - np.float32(T[0, 3])) < reach) & (y > T[1, 3])
+                close &= np.abs(z - np.float32(T[2, 3])) < reach
+                where = where[close]
+                if not len(where):
+                    continue
+                lamp, around = patch_under(points[:, where], _upright(T), size, self.world.light)
                 lights[0][where] *= lamp
                 lights[1][where] *= around
 
     def _patch_window(
-        self, actor: Actor, T_scene_camera: Array, index: int
+        self, actor: Actor, body: _Body, T_scene_camera: Array, index: int
     ) -> tuple[tuple[slice, slice] | None, Array]:
         T = actor.Ts_scene_object[index]
-        low, high = actor.mesh.bounds()
+        low, high = body.low, body.high
         corners = _box_corners(low, high) @ T[:3, :3].T + T[:3, 3]
         size = high - low
         if abs(T[1, 1]) < 0.999:  # tumbling: the box around the turned thing
@@ -284,8 +301,9 @@ class Renderer:
         reach = 0.6 + 0.9 * size[1]
         centre_xz, bottom = T[[0, 2], 3], corners[:, 1].max()
         radius = np.hypot(size[0], size[2]) / 2 + reach
-        low_corner = np.array([centre_xz[0] - radius, bottom - 0.3, centre_xz[1] - radius])
-        high_corner = np.array([centre_xz[0] + radius, bottom + 1.2, centre_xz[1] + radius])
+        drop = self.world.light.patch_drop_m
+        low_corner = np.array([centre_xz[0] - radius, bottom - 0.1, centre_xz[1] - radius])
+        high_corner = np.array([centre_xz[0] + radius, bottom + drop, centre_xz[1] + radius])
         ground = _box_corners(low_corner, high_corner)
         z = (ground - T_scene_camera[:3, 3]) @ T_scene_camera[:3, 2]
         if z.min() > 60.0:  # too far to see
@@ -303,34 +321,39 @@ class Renderer:
         """Texture times light (N, 3) for samples `where` on one body."""
         triangle, t = samples.triangle[where], samples.t[where]
         u, v = samples.u[where], samples.v[where]
-        tiles, right, down, nd = item.view.texture_at(triangle, t, u, v)
+        tiles, right, down = item.view.texture_at(triangle, t, u, v)
         table = item.body.table
         rgba = self._texture(table.texture[triangle], tiles, right, down)
         tinted = rgba[:, 3:] * np.float32(1 / 255)
         colour = rgba[:, :3] * (1 - tinted * (1 - table.tint[triangle]))
-        normal = self._normals(item, triangle, nd, (u, v, t))
-        facing = np.maximum(normal @ self._towards, 0) * lamp
-        up = (0.5 - 0.5 * normal[:, 1]) * around
+        facing, up = self._facing(item, triangle, (u, v, t))
+        facing, up = facing * lamp, up * around
         light = self.world.light
         for channel in range(3):
             shine = facing * np.float32(light.lamp[channel]) + up * np.float32(light.above[channel])
             shine += (around - up) * np.float32(light.below[channel])
             colour[:, channel] *= shine
+        if light.haze_m is not None:
+            clear = np.exp(t * np.float32(-1 / light.haze_m))[:, None]
+            colour -= _HAZE
+            colour *= clear
+            colour += _HAZE
         return colour
 
-    def _normals(
-        self, item: _Placed, triangle: NDArray[np.int32], nd: Floats, at: tuple[Floats, ...]
-    ) -> Floats:
-        """Smooth normals (N, 3) in the scene, on the camera's side of each triangle."""
-        table = item.body.table
-        away = np.where(nd > 0, np.float32(-1), np.float32(1))
-        if item.owner == 0:  # the still world is shaded flat, by its first corners
-            normal = table.corner_normals[:, 0][triangle]
+    def _facing(
+        self, item: _Placed, triangle: NDArray[np.int32], at: tuple[Floats, Floats, Floats]
+    ) -> tuple[Floats, Floats]:
+        """Cosine towards the lamp (N,), and 0 to 1 (N,) from downward to upward, of surfaces."""
+        table, R = item.body.table, item.R_scene_body.astype(np.float32)
+        towards, up = R.T @ self._towards, -R[1]
+        if item.owner == 0:  # the still world is shaded flat: one value a triangle
+            normals = table.corner_normals[:, 0] * item.view.side[:, None]
+            facing, upward = (normals @ towards)[triangle], (normals @ up)[triangle]
         else:
-            normal = table.smooth_normals(triangle, _along(item, *at))
-        flat = table.normal.astype(np.float32)[triangle]
-        side = np.sign(np.einsum("ni,ni->n", normal, flat)) * away
-        return (normal * side[:, None]) @ item.R_scene_body.T.astype(np.float32)
+            normals = table.smooth_normals(triangle, _along(item, *at))
+            side = item.view.side[triangle]
+            facing, upward = (normals @ towards) * side, (normals @ up) * side
+        return np.maximum(facing, 0), 0.5 + 0.5 * upward
 
     def _texture(
         self, texture: NDArray[np.int32], tiles: Floats, right: Floats, down: Floats
@@ -381,22 +404,35 @@ def _cast_body(item: _Placed, u: Floats, v: Floats) -> tuple[Floats, NDArray[np.
     for axis in range(3):
         rays[:, 3 + axis] = d[0, axis] + u * d[1, axis] + v * d[2, axis]
     found = item.body.scene.cast_rays(o3d.core.Tensor(rays))
-    return found["t_hit"].numpy(), found["primitive_ids"].numpy().astype(np.int32)
+    # A miss is an infinite distance, and triangle -1 (Open3D's invalid id, the largest uint32).
+    return found["t_hit"].numpy(), found["primitive_ids"].numpy().view(np.int32)
 
 
 def _along(item: _Placed, u: Floats, v: Floats, t: Floats) -> Floats:
-    """Points (N, 3) in the frame of `item`, at `t` along the rays of pixels."""
+    """Points (3, N) in the frame of `item`, at `t` along the rays of pixels."""
     d = item.rays.astype(np.float32)
-    points = np.empty((len(t), 3), np.float32)
+    points = np.empty((3, len(t)), np.float32)
     for axis in range(3):
         ray = d[0, axis] + u * d[1, axis] + v * d[2, axis]
-        points[:, axis] = np.float32(item.origin[axis]) + t * ray
+        points[axis] = np.float32(item.origin[axis]) + t * ray
     return points
 
 
+def _in_front_of(corners: Array, near_m: float) -> Array:
+    """Corners of a box (8, 3) cut off at z = `near_m`: those in front and where edges cross."""
+    z = corners[:, 2]
+    front = z >= near_m
+    if front.all():
+        return corners
+    a, b = np.array([(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]).T
+    crossing = front[a] != front[b]
+    a, b = a[crossing], b[crossing]
+    share = ((near_m - z[a]) / (z[b] - z[a]))[:, None]
+    return np.concatenate([corners[front], corners[a] + share * (corners[b] - corners[a])])
+
+
 def _box_corners(low: Array, high: Array) -> Array:
-    pick = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T
-    return np.where(pick, high, low)
+    return np.where((np.arange(8)[:, None] >> np.arange(3)) & 1, high, low)
 
 
 def _upright(T: Array) -> Array:

@@ -11,10 +11,10 @@ import numpy as np
 from pipelines.datasets.simulated.meshes import Mesh
 from pipelines.datasets.simulated.raytables import Floats
 from pipelines.datasets.simulated.world import Light
-from pipelines.geometry import invert_T, transform_points
+from pipelines.geometry import invert_T
 from pipelines.types import Array
 
-_MAX_SIDE = 6000
+_MAX_TEXELS = 4_000_000
 _ROW = 2048
 
 
@@ -33,40 +33,46 @@ class ShadowMap:
         local = mesh.vertices @ self._axes.T
         used = local[mesh.triangles[casts].ravel()]
         low, high = used.min(0), used.max(0)
-        texel = max(light.shadow_texel_m, float((high - low)[:2].max()) / _MAX_SIDE)
+        area = float(np.prod((high - low)[:2]))
+        texel = max(light.shadow_texel_m, float(np.sqrt(area / _MAX_TEXELS)))
         w, h = (np.ceil((high - low)[:2] / texel).astype(int) + 4).tolist()
         self._start, self._texel = low[:2] - 2 * texel, texel
         self._far = float(low[2] - 1.0)
-        x, y = np.meshgrid(np.arange(w), np.arange(h))
-        plane = np.stack([x * texel + self._start[0], y * texel + self._start[1]], -1)
-        origins = np.concatenate([plane, np.full((h, w, 1), self._far)], -1) @ self._axes
-        rays = np.concatenate([origins, np.broadcast_to(self._axes[2], origins.shape)], -1)
+        rays = np.empty((h, w, 6), np.float32)
+        corner = np.array([*self._start, self._far]) @ self._axes
+        for i in range(3):
+            row, column = self._axes[1, i] * texel, self._axes[0, i] * texel
+            rays[..., i] = corner[i] + np.arange(h)[:, None] * row + np.arange(w) * column
+            rays[..., 3 + i] = self._axes[2, i]
         scene = o3d.t.geometry.RaycastingScene()
         scene.add_triangles(
             o3d.core.Tensor(mesh.vertices.astype(np.float32)),
             o3d.core.Tensor(mesh.triangles[casts].astype(np.uint32)),
         )
-        depth = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()
+        depth = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
         depth = np.minimum(depth, float(high[2] - low[2]) + 2.0)
         moments = np.stack([depth, depth**2], -1)
         self._moments = cv2.GaussianBlur(moments, (0, 0), light.shadow_blur_texels)
         self._slack = 2.0 * texel
 
     def lit(self, points: Floats) -> Floats:
-        """Share of the lamp, 0 to 1, that reaches points (N, 3) of the scene."""
-        axes = self._axes.astype(np.float32)
-        local = points @ axes.T
-        N = len(points)
+        """Share of the lamp, 0 to 1, that reaches points (3, N) of the scene."""
+        x, y, z = points
+        N = len(x)
         rows = -(-N // _ROW)
         padded = np.zeros((2, rows * _ROW), np.float32)
         for axis in range(2):
-            padded[axis, :N] = (local[:, axis] - self._start[axis]) / np.float32(self._texel)
+            a, b, c = (self._axes[axis] / self._texel).astype(np.float32)
+            start = np.float32(self._start[axis] / self._texel)
+            padded[axis, :N] = a * x + b * y + c * z - start
+        a, b, c = self._axes[2].astype(np.float32)
+        depth = a * x + b * y + c * z - np.float32(self._far + self._slack)
         maps = padded.reshape(2, rows, _ROW)
         found = cv2.remap(
             self._moments, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
         mean, square = found.reshape(-1, 2)[:N].T
-        behind = np.maximum(local[:, 2] - np.float32(self._far + self._slack) - mean, 0)
+        behind = np.maximum(depth - mean, 0)
         # Chebyshev's bound on the share of the texel that lies in front of the point.
         variance = np.maximum(square - mean**2, np.float32(self._slack**2 * 0.25))
         share = variance / (variance + behind**2)
@@ -78,21 +84,21 @@ def patch_under(
 ) -> tuple[Floats, Floats]:
     """Darkening by an upright thing near the ground: lamp and surrounding light left (N,), (N,).
 
-    points: (N, 3) of the still world. size_m: (3,) of the thing's box, whose underside throws the
+    points: (3, N) of the still world. size_m: (3,) of the thing's box, whose underside throws the
     patch. The lamp's patch is drawn away from the lamp, the other lies straight below.
     """
-    local = transform_points(invert_T(T_scene_object), points.astype(float)).astype(np.float32)
-    half = np.asarray(size_m, np.float32) / 2
+    T = invert_T(T_scene_object).astype(np.float32)
+    x, y, z = T[:3, :3] @ points + T[:3, 3:]
+    half = (np.asarray(size_m) / 2).astype(np.float32)
     towards = np.asarray(light.towards) / np.linalg.norm(light.towards)
-    slope = T_scene_object[:3, :3].T @ (towards / max(-towards[1], 0.2))
-    drop = np.maximum(local[:, 1] - half[1], 0)  # how far below the box
-    near = np.exp(-((drop / np.float32(0.9)) ** 2)) * (local[:, 1] > half[1] - 0.3)
-    below = 1 - 0.72 * near * _soft_box(local[:, 0], local[:, 2], half, 0.45)
-    reach = (drop + half[1]) * np.float32(1.0)
-    sx = local[:, 0] + slope[0].astype(np.float32) * reach
-    sz = local[:, 2] + slope[2].astype(np.float32) * reach
-    grown = half * (1.0, 1.0, 1.0) + 0.35 * half[1] * np.abs(slope).astype(np.float32)
-    lamp = 1 - 0.85 * near * _soft_box(sx, sz, grown.astype(np.float32), 0.3)
+    slope = (T[:3, :3] @ (towards / max(-towards[1], 0.2))).astype(np.float32)
+    drop = np.maximum(y - half[1], 0)  # how far below the box
+    fall = np.float32(0.5 * light.patch_drop_m + 0.05)
+    near = np.exp(-((drop / fall) ** 2)) * (y > half[1] - 0.3)
+    below = 1 - 0.72 * near * _soft_box(x, z, half, 0.45)
+    reach = drop + half[1]
+    grown = half + 0.35 * half[1] * np.abs(slope)
+    lamp = 1 - 0.85 * near * _soft_box(x + slope[0] * reach, z + slope[2] * reach, grown, 0.3)
     return lamp, below
 
 

@@ -116,7 +116,7 @@ def make_street(
         _static(road, rng),
         tuple(script.actors),
         _camera_path(road, times),
-        Light((-0.62, -1.0, -0.55), (0.62, 0.58, 0.5), (0.62, 0.66, 0.74), (0.4, 0.38, 0.36)),
+        Light((-0.62, -1.0, -0.55), (0.72, 0.67, 0.57), (0.68, 0.72, 0.79), (0.44, 0.42, 0.4)),
         SURFACES | FACADES | VEHICLE_ART,
         sky="sky",
     )
@@ -372,7 +372,9 @@ def _street_furniture(road: Road, junctions: list[float], rng: np.random.Generat
             facing = np.pi / 2 * inward * -1  # z away from the road
             if k % 3 != 2:
                 parts.append(trees[rng.integers(0, 4)].placed(road.pose(s, line, y, turn)))
-                parts.append(road.strip((s - 0.6, s + 0.6), (line - 0.5, line + 0.5), (0.075,) * 2, "grass"))
+                parts.append(
+                    road.strip((s - 0.6, s + 0.6), (line - 0.5, line + 0.5), (0.075,) * 2, "grass")
+                )
             else:
                 parts.append(lamp_post().placed(road.pose(s, line, y, facing)))
             extra = rng.integers(0, 5)
@@ -385,7 +387,9 @@ def _street_furniture(road: Road, junctions: list[float], rng: np.random.Generat
                 parts.append(planter(rng).placed(road.pose(s + 4.2, line, y, facing)))
             elif extra == 3:
                 sign = ("limit", "parking")[rng.integers(0, 2)]
-                parts.append(road_sign(sign).placed(road.pose(s + 3.5, line, y, 0 if side else np.pi)))
+                parts.append(
+                    road_sign(sign).placed(road.pose(s + 3.5, line, y, 0 if side else np.pi))
+                )
     for j in junctions:
         zebra = j - _CROSSING_S + _ZEBRA_S
         parts.append(traffic_light().placed(road.pose(zebra - 2.7, _KERBS[1] + 0.5, y)))

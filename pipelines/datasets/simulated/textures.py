@@ -47,7 +47,9 @@ def smooth_noise(size: int, cells: int, rng: np.random.Generator) -> Array:
     return (out - out.mean()) / out.std()
 
 
-def fractal_noise(size: int, rng: np.random.Generator, coarsest: int = 4, fall: float = 0.7) -> Array:
+def fractal_noise(
+    size: int, rng: np.random.Generator, coarsest: int = 4, fall: float = 0.7
+) -> Array:
     """Tileable noise (size, size) of unit deviation with detail at every scale."""
     cells, weight = coarsest, 1.0
     total = np.zeros((size, size), np.float32)
@@ -126,7 +128,7 @@ def _brick(rng: np.random.Generator) -> Texture:
 
 
 def _plaster(rng: np.random.Generator) -> Texture:
-    light = 0.94 + 0.045 * grain(512, rng, 1.0) + 0.05 * fractal_noise(512, rng, 3)
+    light = 0.94 + 0.05 * grain(512, rng, 1.0) + 0.028 * fractal_noise(512, rng, 6)
     return Texture(coloured((245, 245, 245), light, tinted=1.0), (3.0, 3.0))
 
 
@@ -149,11 +151,11 @@ def _roof(rng: np.random.Generator) -> Texture:
 def _foliage(rng: np.random.Generator) -> Texture:
     size = 512
     shade = fractal_noise(size, rng, 10, 0.8)
-    rgba = coloured((70, 92, 44), np.clip(0.75 + 0.28 * shade, 0.25, 1.4), tinted=1.0)
+    rgba = coloured((84, 108, 50), np.clip(0.75 + 0.28 * shade, 0.25, 1.4), tinted=1.0)
     for _ in range(2600):
         x, y = rng.integers(6, size - 6, 2)
         bright = rng.uniform(0.55, 1.5)
-        colour = (66 * bright + rng.uniform(0, 22), 98 * bright, 40 * bright, 255.0)
+        colour = (80 * bright + rng.uniform(0, 24), 116 * bright, 46 * bright, 255.0)
         axes = (int(rng.integers(4, 9)), int(rng.integers(2, 4)))
         cv2.ellipse(rgba, (int(x), int(y)), axes, rng.uniform(0, 180), 0, 360, colour, -1)
     return Texture(rgba, (1.6, 1.6))
@@ -165,10 +167,14 @@ def _wood(rng: np.random.Generator, boards: int, tile_m: tuple[float, float]) ->
     y, x = np.mgrid[:size, :size]
     board = y * boards // size
     stretched = cv2.resize(
-        rng.standard_normal((size, 24)).astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC
+        rng.standard_normal((size, 24)).astype(np.float32),
+        (size, size),
+        interpolation=cv2.INTER_CUBIC,
     )
     fine = cv2.resize(
-        rng.standard_normal((size, 96)).astype(np.float32), (size, size), interpolation=cv2.INTER_LINEAR
+        rng.standard_normal((size, 96)).astype(np.float32),
+        (size, size),
+        interpolation=cv2.INTER_LINEAR,
     )
     rings = np.sin(y * boards / size * 30 + 2.2 * smooth_noise(size, 6, rng) + board * 2.1)
     light = 0.95 + 0.06 * stretched + 0.035 * fine + 0.05 * rings
@@ -232,9 +238,9 @@ def _rug(rng: np.random.Generator) -> Texture:
     rgba = coloured((150, 46, 42), 0.93 + 0.09 * grain(size, rng))
     for inset, colour in ((14, (226, 204, 160)), (30, (44, 56, 92)), (60, (226, 204, 160))):
         cv2.rectangle(rgba, (inset, inset), (size - inset, size - inset), (*colour, 0), 6)
-    for centre in np.stack(np.meshgrid(np.arange(104, 460, 76), np.arange(104, 460, 76)), -1).reshape(
-        -1, 2
-    ):
+    for centre in np.stack(
+        np.meshgrid(np.arange(104, 460, 76), np.arange(104, 460, 76)), -1
+    ).reshape(-1, 2):
         diamond = (centre + np.array([(0, -30), (30, 0), (0, 30), (-30, 0)])).astype(np.int32)
         colour = ((226, 204, 160, 0), (44, 56, 92, 0), (196, 140, 60, 0))[centre.sum() // 76 % 3]
         cv2.fillPoly(rgba, [diamond], colour, cv2.LINE_AA)
@@ -266,7 +272,9 @@ def _sky(rng: np.random.Generator) -> Texture:
     blend = np.clip(height * 1.6, 0, 1)[..., None] ** 0.8
     colour = np.array((212, 222, 230.0)) * (1 - blend) + np.array((104, 152, 208.0)) * blend
     colour = np.broadcast_to(colour, (size, 2048, 3))
-    clouds = cv2.resize(fractal_noise(size, rng, 8, 0.62), (2048, size), interpolation=cv2.INTER_CUBIC)
+    clouds = cv2.resize(
+        fractal_noise(size, rng, 8, 0.62), (2048, size), interpolation=cv2.INTER_CUBIC
+    )
     cover = np.clip((clouds - 0.2) / 1.3, 0, 1) * np.clip(height * 5, 0, 1)
     cloud = 246 - 26 * np.clip((clouds - 1.2) / 1.5, 0, 1)
     mixed = colour + cover[..., None] * (cloud[..., None] - colour)

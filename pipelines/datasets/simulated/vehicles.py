@@ -204,11 +204,15 @@ def _side_art(rng: np.random.Generator, shape: CarShape) -> Texture:
         upper = pane.copy()
         upper[:, 1] = np.minimum(upper[:, 1], _TALL - low - 0.17)
         canvas.polygon(upper, _GLASS_TOP)
-        canvas.line([at(rear + 0.2, low + 0.05), at(rear + 0.42, low + 0.4)], (186, 202, 214), 0.03)
+        canvas.line(
+            [at(rear + 0.2, low + 0.05), at(rear + 0.42, low + 0.4)], (150, 168, 182), 0.012
+        )
     for z in edges[1:]:  # doors
         if z < edges[-1] - 0.01 and z - edges[0] > 0.05:
             canvas.line([at(z, low), at(z, 0.36)], (70, 70, 74, 120), 0.018)
-            canvas.rect(z + _LONG / 2 + 0.07, _TALL - 0.86, z + _LONG / 2 + 0.25, _TALL - 0.82, _BLACK)
+            canvas.rect(
+                z + _LONG / 2 + 0.07, _TALL - 0.86, z + _LONG / 2 + 0.25, _TALL - 0.82, _BLACK
+            )
     front_door = edges[-1] - 0.02
     canvas.line([at(front_door, low), at(front_door + 0.06, 0.36)], (70, 70, 74, 120), 0.018)
     for z in shape.axles_z:
@@ -258,9 +262,15 @@ def _above_art(rng: np.random.Generator, shape: CarShape) -> Texture:
         canvas.polygon([inner[2], inner[3], (m, middle - 0.5), (m, middle + 0.5)], (122, 142, 158))
     for side in (-1, 1):  # folds of the bonnet, roof rails
         y = middle + side * half * 0.62
-        canvas.line([(hood + _LONG / 2, y), (shape.size_m[2] / 2 + _LONG / 2, y * 0.98)], (205,) * 3 + (255,), 0.02)
+        canvas.line(
+            [(hood + _LONG / 2, y), (shape.size_m[2] / 2 + _LONG / 2, y * 0.98)],
+            (205,) * 3 + (255,),
+            0.02,
+        )
         y = middle + side * half * 0.68
-        canvas.line([(roof.min() + _LONG / 2, y), (roof.max() + _LONG / 2, y)], (150,) * 3 + (255,), 0.03)
+        canvas.line(
+            [(roof.min() + _LONG / 2, y), (roof.max() + _LONG / 2, y)], (150,) * 3 + (255,), 0.03
+        )
     return canvas.texture(rng, 0.015)
 
 

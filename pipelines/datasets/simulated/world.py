@@ -37,7 +37,7 @@ class Light:
 
     towards: (3,) direction to the lamp in the scene. shadow_texel_m, shadow_blur_texels: sharpness
     of the shadows of what stands still. ceiling_m: whatever lies above this height (y below it)
-    casts no shadow. haze_m: distance at which the air hides 63 %, None indoors.
+    casts no shadow. patch_drop_m: how far below a movable thing its dark patch reaches. haze_m: distance at which the air hides 63 %, None indoors.
     """
 
     towards: tuple[float, float, float]
@@ -47,6 +47,7 @@ class Light:
     shadow_texel_m: float = 0.08
     shadow_blur_texels: float = 1.2
     ceiling_m: float = -np.inf
+    patch_drop_m: float = 0.35
     haze_m: float | None = 420.0
 
 
