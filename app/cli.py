@@ -183,7 +183,11 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--stride", type=_positive, default=1, metavar="S", help="every S-th frame")
     parser.add_argument("--seed", type=_not_negative, metavar="N", help="of all random choices")
     parser.add_argument(
-        "--degrade", action="store_true", help="simulated sequences: noisy, worn inputs"
+        "--degrade",
+        nargs="?",
+        const="all",
+        metavar="WHAT",
+        help="simulated sequences: noisy, worn inputs; all of them, or for example flow,masks",
     )
     _add_settings(parser)
     _add_output(parser)

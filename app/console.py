@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -111,6 +111,28 @@ def working(what: str, quiet: bool = False) -> Iterator[None]:
     else:
         stderr.print(f"{what} ...", highlight=False)
         yield
+
+
+@contextmanager
+def counting(what: str, quiet: bool = False) -> Iterator[Callable[[int, int], None]]:
+    """A function (done, total) that shows how far something is; nothing appears before its call."""
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    printed_s = time.monotonic()
+    with RichProgress(*columns, console=stderr, transient=True) as bar:
+        task: Any = None
+
+        def show(done: int, total: int) -> None:
+            nonlocal task, printed_s
+            if quiet:
+                return
+            if stderr.is_terminal:
+                task = bar.add_task("", total=total) if task is None else task
+                bar.update(task, completed=done)
+            elif done == total or time.monotonic() - printed_s >= PLAIN_EVERY_S:
+                printed_s = time.monotonic()
+                stderr.print(f"  {what}: {done} of {total}", highlight=False)
+
+        yield show
 
 
 def metrics(metrics: dict[str, Any], timings: dict[str, Any], folder: str) -> None:

@@ -24,9 +24,11 @@ def run(arguments: Namespace) -> int:
     if arguments.seed is not None:
         overrides.append(f"tracking.seed={arguments.seed}")
     config = load_config(arguments.config, overrides)
-    sequence = open_sequence(
-        arguments.path, arguments.dataset, arguments.sequence, **_simulation_options(arguments)
-    )
+    options = _simulation_options(arguments)
+    with console.counting("rendering the scene", arguments.quiet) as progress:
+        if _is_simulated(arguments):
+            options["progress"] = progress
+        sequence = open_sequence(arguments.path, arguments.dataset, arguments.sequence, **options)
     span = {"start": arguments.start, "frames": arguments.frames, "stride": arguments.stride}
     result = _process(sequence, config, arguments.output, arguments.quiet, span)
     folder = console.shorten(result.folder)
@@ -44,7 +46,8 @@ def demo(arguments: Namespace) -> int:
     from viz.render import render_result
 
     quiet = arguments.quiet
-    sequence = open_sequence(f"{SIMULATED}:demo")
+    with console.counting("rendering the scene", quiet) as progress:
+        sequence = open_sequence(f"{SIMULATED}:demo", progress=progress)
     span = {"frames": arguments.frames}
     result = _process(sequence, load_config(), arguments.output, quiet, span)
     if result.metrics["run"]["interrupted"]:
@@ -116,17 +119,19 @@ def _code(result: Any) -> int:
     return 0
 
 
+def _is_simulated(arguments: Namespace) -> bool:
+    named = arguments.path == SIMULATED or arguments.path.startswith(f"{SIMULATED}:")
+    return named or arguments.dataset == SIMULATED
+
+
 def _simulation_options(arguments: Namespace) -> dict[str, Any]:
     """Options that only simulated sequences take."""
-    simulated = arguments.dataset == SIMULATED or arguments.path.startswith(f"{SIMULATED}:")
-    if arguments.degrade and not simulated:
-        raise ConfigError(
-            f"--degrade wears the inputs of simulated sequences; {arguments.path} is none: "
-            "leave --degrade out or run simulated:street"
-        )
-    options: dict[str, Any] = {}
-    if simulated and arguments.degrade:
-        options["degrade"] = True
-    if simulated and arguments.seed is not None:
-        options["seed"] = arguments.seed
-    return options
+    if not _is_simulated(arguments):
+        if arguments.degrade:
+            raise ConfigError(
+                f"--degrade wears the inputs of simulated sequences, and {arguments.path} is none: "
+                "leave --degrade out or run simulated:street"
+            )
+        return {}
+    given = {"degrade": arguments.degrade, "seed": arguments.seed}
+    return {name: value for name, value in given.items() if value is not None}

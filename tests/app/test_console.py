@@ -51,6 +51,20 @@ def test_a_run_that_ends_early_closes_the_bar(screen) -> None:
     bar.finish()
 
 
+def test_counting_shows_how_far_something_is(screen) -> None:
+    with console.counting("rendering") as show:
+        for done in range(1, 4):
+            show(done, 3)
+    assert "rendering" in screen.getvalue()
+    assert "3 of 3" in screen.getvalue() or "3/3" in screen.getvalue()
+
+
+def test_counting_is_silent_without_a_call_and_where_asked(screen) -> None:
+    with console.counting("rendering", quiet=True) as show:
+        show(3, 3)
+    assert "rendering" not in screen.getvalue()
+
+
 def test_metrics_come_with_units_and_tell_of_an_interruption(screen) -> None:
     console.metrics(METRICS, {}, "results/x")
     text = screen.getvalue()

@@ -57,7 +57,11 @@ def test_flags_reach_the_run(calls) -> None:
 def test_the_seed_reaches_settings_and_simulation(calls) -> None:
     runs.run(words("run simulated:street --seed 7 --degrade"))
     assert calls["config"].tracking.seed == 7
-    assert calls["opened"][3] == {"seed": 7, "degrade": True}
+    options = calls["opened"][3]
+    assert callable(options.pop("progress"))
+    assert options == {"seed": 7, "degrade": "all"}
+    runs.run(words("run simulated:street --degrade flow,masks"))
+    assert calls["opened"][3]["degrade"] == "flow,masks"
     runs.run(words("run data --seed 7"))
     assert calls["config"].tracking.seed == 7
     assert calls["opened"][3] == {}
