@@ -21,12 +21,12 @@ def draw_polyline(picture: Image, view: View, line: Polyline, *, dark: bool = Fa
 
     scale = line_scale(view)
     color = line_color(line, dark)
+    # A path that has a name stays legible in the smallest picture.
+    width_px = max(2 if line.label else 1, round(line.width_px * scale))
     for points_m in _visible(line, view):
         uv, _ = view.project(points_m)
         fixed = np.round(np.clip(uv, -1e5, 1e5) * 16).astype(np.int32).reshape(-1, 1, 2)
-        cv2.polylines(
-            picture, [fixed], False, color, max(1, round(line.width_px * scale)), cv2.LINE_AA, 4
-        )
+        cv2.polylines(picture, [fixed], False, color, width_px, cv2.LINE_AA, 4)
 
 
 def line_scale(view: View) -> float:

@@ -41,7 +41,7 @@ def draw_frame(frame: Frame, result: FrameResult) -> Image:
     tracked = result.point_ids >= 0
     uv = result.keypoints_px
     groups = (
-        (~tracked & ~result.inliers, "dot", radius_px * 0.45, style.UNTRACKED),
+        (~tracked & ~result.inliers, "dot", max(1.4, radius_px * 0.45), style.UNTRACKED),
         (tracked & ~result.inliers, "cross", radius_px * 1.1, style.OUTLIER),
         (result.inliers, "ring", radius_px, style.INLIER),
     )

@@ -27,7 +27,7 @@ logger = logging.getLogger("dyob.viz")
 
 RENDERERS = ("auto", "open3d", "splat")
 POINT_SHARE = 0.0011  # radius of a point as a share of the map's extent
-LIGHTEST = 0.86  # colours are scaled down to this on white, where lighter ones would vanish
+LIGHTEST = 0.82  # colours are scaled down to this on white, where lighter ones would vanish
 
 
 def render_result(

@@ -18,7 +18,7 @@ from viz import style
 
 STRAY_QUANTILE = 0.95  # of the points' distances to the path: what lies far beyond is stray
 STRAY_FACTOR = 1.6
-N_FRUSTUMS = 20
+N_FRUSTUMS = 15
 FRUSTUM_SHARE = 0.013  # frustum depth as a share of the scene's extent
 GAP_FACTOR = 1.5  # median frame intervals; a longer one breaks the drawn path
 
@@ -73,7 +73,7 @@ class View:
 def build_scene(result: Result, *, keyframe_every: int | None = None) -> Scene:
     """Scene of a result: map points, the estimated and the true path, and some camera frustums.
 
-    keyframe_every: a frustum at every n-th pose; by default about twenty along the path.
+    keyframe_every: a frustum at every n-th pose; by default about fifteen along the path.
     """
     Ts = result.Ts_world_camera
     path = Ts[:, :3, 3] if len(Ts) else np.zeros((1, 3))

@@ -145,7 +145,8 @@ def _kitti(
     est_row = np.full(len(gt), -1)
     est_row[gt_rows] = np.arange(len(gt_rows))
     starts = np.arange(0, len(frames), KITTI_START_STEP)
-    t_errors, r_errors = [np.empty(0)], [np.empty(0)]
+    t_errors: list[Array] = []
+    r_errors: list[Array] = []
     for length_m in KITTI_LENGTHS_M:
         ends = np.searchsorted(distance_m, distance_m[starts] + length_m, side="right")
         there = ends < len(frames)

@@ -148,7 +148,8 @@ def load_result(path: Path | str) -> Result:
     gt_stamps, gt_Ts = None, None
     if (folder / names.CAMERA_GT_TUM).exists():
         gt_stamps, gt_Ts = read_tum(folder / names.CAMERA_GT_TUM)
-    points, colors = np.empty((0, 3)), np.empty((0, 3), np.uint8)
+    points: Array = np.empty((0, 3))
+    colors: NDArray[np.uint8] = np.empty((0, 3), np.uint8)
     if (folder / names.STATIC_MAP).exists():
         points, colors = read_point_cloud(folder / names.STATIC_MAP)
     metrics, timings, config = (
