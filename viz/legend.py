@@ -12,7 +12,7 @@ import numpy as np
 from pipelines.io.result import Result
 from pipelines.types import Image
 from viz import style
-from viz.lines import line_color, line_scale
+from viz.lines import line_scale
 from viz.scene import Scene, View
 
 BAR_STEPS = (1.0, 2.0, 5.0)
@@ -24,7 +24,7 @@ def draw_legend(
     """Title at the top left, legend below, scale bar at the bottom right where there is a scale."""
     ink = style.WHITE if dark else style.INK
     panel = style.BACKGROUNDS["black" if dark else "white"]
-    _draw_ends(picture, scene, view, panel)
+    _draw_ends(picture, scene, view, panel, dark)
     _draw_title(picture, result, view, ink, panel)
     _draw_key(picture, scene, view, ink, panel, dark)
     if view.px_per_m is not None:
@@ -94,7 +94,8 @@ def _draw_key(picture: Image, scene: Scene, view: View, ink: Any, panel: Any, da
         v = top + row * step + step // 2
         thick = max(1, round(line.width_px * line_scale(view)))
         ends = (margin, v), (margin + sample, v)
-        cv2.line(picture, *ends, line_color(line, dark), thick, cv2.LINE_AA)
+        color = style.on_dark(line.color) if dark else line.color
+        cv2.line(picture, *ends, color, thick, cv2.LINE_AA)
         at = (margin + sample + text_px // 2, v + round(0.36 * text_px))
         style.draw_text(picture, label, at, text_px, ink)
 
@@ -122,13 +123,14 @@ def _draw_scale_bar(picture: Image, view: View, ink: Any, panel: Any) -> None:
     style.draw_text(picture, label, at, text_px, ink)
 
 
-def _draw_ends(picture: Image, scene: Scene, view: View, panel: Any) -> None:
+def _draw_ends(picture: Image, scene: Scene, view: View, panel: Any, dark: bool) -> None:
     """A disc and a word at the first and the last camera."""
     import cv2
 
     text_px, _ = _sizes(view)
     ends = (("end", scene.path_m[-1:], style.END), ("start", scene.path_m[:1], style.START))
-    for word, point, color in ends:
+    for word, point, plain_color in ends:
+        color = style.on_dark(plain_color) if dark else plain_color
         uv, depth = view.project(point)
         u, v = (int(x) for x in np.round(np.clip(uv[0], -1e4, 1e4)))
         if depth[0] <= 0 or not (0 <= u < view.size[0] and 0 <= v < view.size[1]):

@@ -12,7 +12,6 @@ from viz import style
 from viz.scene import Polyline, View
 
 NEAR_M = 0.05
-ON_DARK = {style.ESTIMATE: (90, 180, 255)}
 
 
 def draw_polyline(picture: Image, view: View, line: Polyline, *, dark: bool = False) -> None:
@@ -20,7 +19,7 @@ def draw_polyline(picture: Image, view: View, line: Polyline, *, dark: bool = Fa
     import cv2
 
     scale = line_scale(view)
-    color = line_color(line, dark)
+    color = style.on_dark(line.color) if dark else line.color
     # A path that has a name stays legible in the smallest picture.
     width_px = max(2 if line.label else 1, round(line.width_px * scale))
     for points_m in _visible(line, view):
@@ -32,11 +31,6 @@ def draw_polyline(picture: Image, view: View, line: Polyline, *, dark: bool = Fa
 def line_scale(view: View) -> float:
     """How much wider than named lines are drawn, so that large pictures look like small ones."""
     return max(view.size[0] / 1280.0, 0.5)
-
-
-def line_color(line: Polyline, dark: bool) -> style.Color:
-    """The line's colour, or a light one where it would not stand out from a dark ground."""
-    return ON_DARK.get(line.color, line.color) if dark else line.color
 
 
 def _visible(line: Polyline, view: View) -> list[Array]:

@@ -45,6 +45,19 @@ OBJECT_COLORS: tuple[Color, ...] = (
 BACKGROUNDS: dict[str, Color] = {"white": WHITE, "black": (16, 18, 22)}
 
 
+# Lighter kinds of the colours above that would not stand out from a dark ground.
+ON_DARK: dict[Color, Color] = {
+    ESTIMATE: (90, 180, 255),
+    START: (70, 215, 165),
+    END: (240, 125, 195),
+}
+
+
+def on_dark(color: Color) -> Color:
+    """The colour as it is drawn on a dark ground."""
+    return ON_DARK.get(color, color)
+
+
 def object_color(object_id: int) -> Color:
     """The colour of an object, the same in every picture and run: it depends on its id alone."""
     base = OBJECT_COLORS[(object_id - 1) % len(OBJECT_COLORS)]
