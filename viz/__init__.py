@@ -1,0 +1,1 @@
+"""Pictures of frames, maps and errors, made without a display."""

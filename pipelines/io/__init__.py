@@ -1,0 +1,1 @@
+"""Files of a result folder: trajectories, point clouds, timings, metrics."""
