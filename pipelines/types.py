@@ -34,7 +34,8 @@ def _check_shape(owner: str, name: str, array: NDArray, expected: tuple[int | No
 class StereoCamera:
     """A rectified pinhole pair, or an RGB-D camera with a virtual right one.
 
-    `bf` is baseline times fx in px * m, so that disparity [px] = bf / depth [m].
+    `bf` is baseline times fx in px * m, so that disparity [px] = bf / depth [m]. Where depth comes
+    from a depth sensor the right camera is virtual: `bf` is then a convention, not a measurement.
     """
 
     width: int
@@ -44,6 +45,7 @@ class StereoCamera:
     cx: float
     cy: float
     bf: float
+    is_rgbd: bool = False
 
     def __post_init__(self) -> None:
         if min(self.width, self.height, self.fx, self.fy, self.bf) <= 0:

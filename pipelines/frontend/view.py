@@ -83,6 +83,7 @@ def make_view(
     depth_m: NDArray[np.float32] | None,
     orb: OrbExtractor,
     sigma_disparity_px: float,
+    disparity_offset_px: float,
 ) -> View:
     """The view of a frame whose depth (H, W) in m is known; None means no depth at all."""
     gray = to_gray(frame.image)
@@ -91,7 +92,7 @@ def make_view(
     else:
         with np.errstate(divide="ignore", invalid="ignore"):
             disparity = np.where(depth_m > 0, np.float32(camera.bf) / depth_m, np.float32(np.nan))
-        disparity = disparity.astype(np.float32, copy=False)
+        disparity = disparity.astype(np.float32) + np.float32(disparity_offset_px)
     static = static_pixels(frame.instance_labels, gray.shape, orb.config.mask_dilation_px)
     features = orb.extract(normalise_contrast(gray), static)
     disparity_at = sample_disparity(disparity, features.uv_px, sigma_disparity_px)

@@ -55,11 +55,13 @@ def refine_points(
     T_world_camera: Array,
     pose_covariance: Array,
     observations: StereoObservations,
-) -> tuple[Array, Array]:
-    """Points (N, 3) and covariances (N, 3, 3) after the observations of one image.
+    sensitivities: Array,
+) -> tuple[Array, Array, Array]:
+    """Points (N, 3), covariances (N, 3, 3) and sensitivities (N, 3) after one image.
 
     The pose's covariance (6, 6) counts as observation noise, so that a poor pose moves no point.
-    All points must lie in front of the camera.
+    All points must lie in front of the camera. sensitivities: (N, 3) d(point in the world) /
+    d(disparity offset), which follow the points through the update.
     """
     R = T_world_camera[:3, :3]
     points = transform_points(invert_T(T_world_camera), observations.points_world_m)
@@ -68,7 +70,9 @@ def refine_points(
     J_point = D @ R.T
     residual = observations.uvr_px - project_stereo(camera, points)
     mono = np.isnan(residual[:, 2])
-    residual[mono, 2] = 0.0
+    slope = -np.einsum("nij,nj->ni", J_point, sensitivities)  # d residual / d offset
+    slope[:, 2] -= 1.0
+    residual[mono, 2] = slope[mono, 2] = 0.0
     S = J_pose @ pose_covariance @ J_pose.transpose(0, 2, 1)
     variance = observations.sigma_uv_px**2
     for row, column in ((0, 0), (1, 1), (0, 2), (2, 0), (2, 2)):
@@ -87,7 +91,9 @@ def refine_points(
     M = R @ M @ R.T
     P_new = M @ P_new @ M.transpose(0, 2, 1)
     P_new = 0.5 * (P_new + P_new.transpose(0, 2, 1))
-    return transform_points(T_world_camera, moved), P_new
+    slope_new = sensitivities + np.einsum("nij,nj->ni", gain, slope)
+    slope_new = np.einsum("nij,nj->ni", M, slope_new)
+    return transform_points(T_world_camera, moved), P_new, slope_new
 
 
 def _step_in_inverse_depth(points: Array, step: Array) -> tuple[Array, Array]:

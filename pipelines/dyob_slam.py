@@ -1,0 +1,155 @@
+"""The system: a frame goes in, a result comes out.
+
+Owns the order of the steps and the state between frames. Each step is a function or a small class
+in `depth`, `frontend` and `mapping`; ground truth never comes near.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import Config
+from pipelines.depth import StereoDepth
+from pipelines.frontend.orb import OrbExtractor
+from pipelines.frontend.tracking import TrackedFrame, Tracker
+from pipelines.frontend.view import View, make_view
+from pipelines.mapping.keyframe import Tracks
+from pipelines.mapping.local_mapping import LocalMapping
+from pipelines.mapping.sparse_map import SparseMap
+from pipelines.types import (
+    Array,
+    Frame,
+    FrameResult,
+    MotionHypothesis,
+    StaticMap,
+    StereoCamera,
+    TrackingStatus,
+)
+
+
+class DyObSlam:
+    """Dynamic-object SLAM of one camera, frame by frame.
+
+    >>> slam = DyObSlam(sequence.camera)
+    >>> result = slam.process(sequence.read(0))
+    """
+
+    def __init__(self, camera: StereoCamera, config: Config | None = None) -> None:
+        self.camera = camera
+        self.config = config or Config()
+        self.map = SparseMap(camera, self.config.mapping)
+        self._orb = OrbExtractor(self.config.orb)
+        self._stereo: StereoDepth | None = None
+        self._tracker = Tracker(camera, self.config.tracking, self.config.depth)
+        self._mapping = LocalMapping(camera, self.config)
+        self._lost_frames = 0
+        self._timings_ms: dict[str, float] = {}
+
+    def process(self, frame: Frame) -> FrameResult:
+        """Track one frame and grow the map. Frames must come in order of time."""
+        self._timings_ms = {}
+        with self._stage("total"):
+            # 0. Depth, given or by stereo
+            with self._stage("depth"):
+                depth_m = self._depth(frame)
+            # 1 and 3. Movable objects are masked; ORB features on the static part
+            with self._stage("features"):
+                view = self._see(frame, depth_m)
+            # 4. Camera pose
+            tracked = self._track(view)
+            # 10. Sparse map
+            with self._stage("mapping"):
+                is_keyframe = self._grow_map(view, tracked)
+        return self._result(frame, tracked, is_keyframe)
+
+    def static_map(self) -> StaticMap:
+        """The sparse static map as it stands, copied."""
+        return self.map.snapshot()
+
+    # ------------------------------------------------------------------ steps
+
+    def _depth(self, frame: Frame) -> NDArray[np.float32] | None:
+        if frame.depth_m is not None or frame.image_right is None:
+            return frame.depth_m
+        if self._stereo is None:
+            self._stereo = StereoDepth(self.config.depth, self.camera)
+        return self._stereo.compute(frame.image, frame.image_right)
+
+    def _see(self, frame: Frame, depth_m: NDArray[np.float32] | None) -> View:
+        sigma = self._tracker.noise.sigma_disparity_px
+        offset = self._tracker.offset.offset_px
+        return make_view(self.camera, frame, depth_m, self._orb, sigma, offset)
+
+    def _track(self, view: View) -> TrackedFrame:
+        if self._tracker.motion is None:
+            return self._start(view, np.eye(4))
+        tracked = self._tracker.track(view, self.map, self._stage)
+        if tracked.status is TrackingStatus.OK:
+            self._tracker.motion.update(
+                tracked.T_world_camera, view.timestamp_s, continuous=self._lost_frames == 0
+            )
+            self._lost_frames = 0
+            return tracked
+        self._tracker.forget_flow()
+        if len(self._mapping.mappable_features(self._tracker, view, Tracks.empty())):
+            self._lost_frames += 1
+        if self._lost_frames >= self.config.tracking.restart_after_frames:
+            return self._start(view, tracked.T_world_camera)
+        return tracked
+
+    def _start(self, view: View, T_world_camera: Array) -> TrackedFrame:
+        """First frame, or a new start at the predicted pose after a lost stretch."""
+        n_points = len(self._mapping.mappable_features(self._tracker, view, Tracks.empty()))
+        enough = n_points >= self.config.tracking.min_inliers
+        if enough:
+            self._tracker.start(view, T_world_camera)
+            self._lost_frames = 0
+        return TrackedFrame(
+            TrackingStatus.OK if enough else TrackingStatus.LOST,
+            MotionHypothesis.FIRST_FRAME if enough else MotionHypothesis.NONE,
+            T_world_camera,
+            np.zeros((6, 6)) if enough else np.full((6, 6), np.nan),
+            Tracks.empty(),
+            np.zeros(0, bool),
+            np.nan,
+            np.empty(0, np.int64),
+        )
+
+    def _grow_map(self, view: View, tracked: TrackedFrame) -> bool:
+        if tracked.status is not TrackingStatus.OK:
+            return False
+        tracks, is_keyframe = self._mapping.integrate(self.map, self._tracker, view, tracked)
+        self._tracker.remember(view, tracks)
+        return is_keyframe
+
+    # ---------------------------------------------------------------- answers
+
+    def _result(self, frame: Frame, tracked: TrackedFrame, is_keyframe: bool) -> FrameResult:
+        return FrameResult(
+            frame.index,
+            frame.timestamp_s,
+            tracked.status,
+            tracked.T_world_camera,
+            tracked.covariance,
+            tracked.hypothesis,
+            is_keyframe,
+            tracked.tracks.uv_px,
+            tracked.tracks.point_ids,
+            tracked.inliers,
+            tracked.rmse_px,
+            self._timings_ms,
+        )
+
+    @contextmanager
+    def _stage(self, name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            spent = 1e3 * (time.perf_counter() - begin)
+            self._timings_ms[name] = self._timings_ms.get(name, 0.0) + spent

@@ -1,0 +1,95 @@
+"""Self-calibration of a stereo pair: a constant error of its disparities, learned while driving.
+
+A tenth of a pixel of disparity error makes far points half a percent too far and every step of the
+camera as much too long. Near and far points then disagree about the camera's motion, which makes
+the error observable. Owns that estimate; the map keeps how each point depends on it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.frontend.motion_only_ba import StereoObservations, observation_information
+from pipelines.geometry import (
+    invert_T,
+    pose_jacobian,
+    project_stereo,
+    projection_jacobian,
+    skew,
+    transform_points,
+)
+from pipelines.types import Array, StereoCamera
+
+_PRIOR_SIGMA_PX = 1.0  # a rectified pair is off by less than this
+_INDEPENDENT_SHARE = 0.05  # errors of the same points in consecutive frames are alike
+_SIGNIFICANT_SIGMAS = 1.0  # a smaller offset is not told from none
+_SIGNIFICANT_PX = 0.03  # nor does a smaller one matter
+_FORGET = 0.99  # share of the evidence that each frame keeps
+
+
+class DisparityOffset:
+    """Running least-squares estimate of the offset b in true disparity = measured + b."""
+
+    def __init__(self) -> None:
+        self.offset_px = 0.0
+        self._information = 0.0
+        self._gradient = 0.0
+
+    @property
+    def sigma_px(self) -> float:
+        """Standard deviation of the offset."""
+        return (self._information + _PRIOR_SIGMA_PX**-2) ** -0.5
+
+    def learn(
+        self,
+        camera: StereoCamera,
+        T_world_camera: Array,
+        observations: StereoObservations,
+        sensitivities: Array,
+    ) -> Array:
+        """Take in the inliers of one frame, at the pose that fits them best.
+
+        sensitivities: (N, 3) d(point in the world) / d(offset). Returns how the camera's pose
+        depends on the offset, (6,) d[omega, v] / d(offset), right perturbation.
+        """
+        R = T_world_camera[:3, :3]
+        points = transform_points(invert_T(T_world_camera), observations.points_world_m)
+        D = projection_jacobian(camera, points)
+        J = pose_jacobian(D, points)
+        information = observation_information(camera, T_world_camera, observations)
+        residual = observations.uvr_px - project_stereo(camera, points)
+        slope = -np.einsum("nij,nj->ni", D, sensitivities @ R)  # d residual / d offset
+        slope[:, 2] -= 1.0
+        mono = np.isnan(residual[:, 2])
+        residual[mono, 2] = slope[mono, 2] = 0.0
+        weighted = information @ J
+        H = np.einsum("nij,nik->jk", J, weighted)
+        pose_slope = np.linalg.solve(H + 1e-9 * np.eye(6), np.einsum("nij,ni->j", weighted, slope))
+        slope -= J @ pose_slope  # what is left once the pose has followed the offset
+        evidence = np.einsum("nij,nj->ni", information, slope)
+        self._information *= _FORGET
+        self._gradient *= _FORGET
+        self._information += _INDEPENDENT_SHARE * float((evidence * slope).sum())
+        self._gradient += _INDEPENDENT_SHARE * float((evidence * residual).sum())
+        return pose_slope
+
+    def step(self) -> float:
+        """Move the offset to its present optimum, or to none; returns by how much, in px."""
+        prior = _PRIOR_SIGMA_PX**-2
+        step = -(self._gradient + prior * self.offset_px) / (self._information + prior)
+        best = self.offset_px + step
+        if abs(best) < max(_SIGNIFICANT_SIGMAS * self.sigma_px, _SIGNIFICANT_PX):
+            step = -self.offset_px
+        self.offset_px += step
+        self._gradient += self._information * step
+        return step
+
+
+def follow_camera(T_world_camera: Array, points_world_m: Array, pose_slope: Array) -> Array:
+    """(N, 3) d(point in the world) / d(offset) due to the camera's own dependence `pose_slope`.
+
+    Added to the points' sensitivities, it expresses them with the present camera held still.
+    """
+    points = transform_points(invert_T(T_world_camera), points_world_m)
+    in_camera = np.einsum("nij,j->ni", skew(points), pose_slope[:3]) - pose_slope[3:]
+    return in_camera @ T_world_camera[:3, :3].T

@@ -1,0 +1,199 @@
+"""What a tracked frame does to the map: refine points, add points, make keyframes, cull.
+
+Owns step 10 of the design, in its order. Storage is `sparse_map`, formulas are `point_filter` and
+`triangulation`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pipelines.config import Config
+from pipelines.frontend.tracking import TrackedFrame, Tracker
+from pipelines.frontend.view import View
+from pipelines.mapping.keyframe import Keyframe, Tracks, needs_keyframe
+from pipelines.mapping.point_filter import make_points, refine_points
+from pipelines.mapping.sparse_map import SparseMap
+from pipelines.mapping.triangulation import (
+    check_triangulated,
+    match_along_epipolar_lines,
+    triangulate,
+)
+from pipelines.geometry import invert_T, projection_jacobian, transform_points
+from pipelines.types import Array, Features, StereoCamera
+
+_SIGMA_NEW_UV_PX = 0.05  # a point is by definition where it was first seen
+_FAR_RELATIVE_SIGMA = 0.5  # a far point's disparity is only a first guess, to be triangulated
+_MIN_FAR_DISPARITY_PX = 1.5  # below this a disparity does not even say that much
+_MIN_FAR_SIGMAS = 3.0  # nor when it is within this many standard deviations of zero
+_TRIANGULATED_SIGMA_PX = 1.0  # px, of both pixels of a triangulated point
+
+
+class LocalMapping:
+    """Grows a `SparseMap` frame by frame."""
+
+    def __init__(self, camera: StereoCamera, config: Config) -> None:
+        self.camera, self.config = camera, config
+
+    def integrate(
+        self, sparse_map: SparseMap, tracker: Tracker, view: View, tracked: TrackedFrame
+    ) -> tuple[Tracks, bool]:
+        """Take a tracked frame into the map.
+
+        Returns the tracks that the next frame will follow, and whether this is a keyframe.
+        """
+        tracks = tracked.tracks[tracked.inliers]
+        sparse_map.record_sight(
+            np.concatenate([tracked.visible_ids, tracked.tracks.point_ids]), tracks.point_ids
+        )
+        self._refine(sparse_map, tracker, tracked, tracks)
+        free = self.mappable_features(tracker, view, tracks)
+        budget = max(0, self.config.orb.n_features - len(tracks))
+        new = self._add_points(sparse_map, tracker, view, tracked.T_world_camera, free[:budget])
+        tracks = Tracks.concatenate(tracks, new)
+        last = sparse_map.keyframes[-1] if sparse_map.keyframes else None
+        is_keyframe = needs_keyframe(self.config.mapping, tracks, last, view.frame_index)
+        if is_keyframe:
+            tracks = self._add_keyframe(sparse_map, view, tracked, tracks)
+        sparse_map.cull_points(tracks.point_ids)
+        return tracks[sparse_map.alive[tracks.point_ids]], is_keyframe
+
+    def mappable_features(self, tracker: Tracker, view: View, tracks: Tracks) -> NDArray[np.int64]:
+        """Features with some depth, away from the tracked points; the strongest first."""
+        features = view.features
+        if len(features) == 0:
+            return np.empty(0, np.int64)
+        disparity = self.camera.bf / features.depth_m
+        sigma = tracker.noise.sigma_disparity_px
+        usable = disparity > max(_MIN_FAR_DISPARITY_PX, _MIN_FAR_SIGMAS * sigma)
+        usable |= disparity >= tracker.min_close_disparity_px
+        usable &= self._away_from(features.uv_px, tracks.uv_px)
+        chosen = np.flatnonzero(usable)
+        return chosen[np.argsort(-features.response[chosen], kind="stable")]
+
+    def _away_from(self, uv_px: Array, occupied_px: Array) -> NDArray[np.bool_]:
+        if len(occupied_px) == 0:
+            return np.ones(len(uv_px), bool)
+        apart = self.config.tracking.min_points_apart_px
+        distance, _ = cKDTree(occupied_px).query(uv_px, distance_upper_bound=apart)
+        return ~np.isfinite(distance)
+
+    def _refine(
+        self, sparse_map: SparseMap, tracker: Tracker, tracked: TrackedFrame, tracks: Tracks
+    ) -> None:
+        if len(tracks) == 0:
+            return
+        ids, T = tracks.point_ids, tracked.T_world_camera
+        observations = sparse_map.observe(tracks, tracker.noise.sigma_disparity_px)
+        if self.config.tracking.calibrate_disparity and not self.camera.is_rgbd:
+            pose_slope = tracker.offset.learn(
+                self.camera, T, observations, sparse_map.offset_slope[ids]
+            )
+            sparse_map.shift_offset(T, pose_slope, tracker.offset.step())
+            observations = sparse_map.observe(tracks, tracker.noise.sigma_disparity_px)
+        points, covariances, slopes = refine_points(
+            self.camera, T, tracked.covariance, observations, sparse_map.offset_slope[ids]
+        )
+        sparse_map.position_m[ids] = points
+        sparse_map.covariance_m2[ids] = covariances
+        sparse_map.offset_slope[ids] = slopes
+
+    def _add_points(
+        self,
+        sparse_map: SparseMap,
+        tracker: Tracker,
+        view: View,
+        T_world_camera: Array,
+        chosen: NDArray[np.int64],
+    ) -> Tracks:
+        """Close points at once; far ones with hardly any say of their depth, until it is seen."""
+        features = view.features[chosen]
+        if len(features) == 0:
+            return Tracks.empty()
+        disparity = self.camera.bf / features.depth_m
+        close = disparity >= tracker.min_close_disparity_px
+        sigma = tracker.noise.sigma_disparity_px
+        sigma_disparity = np.where(close, sigma, np.maximum(sigma, _FAR_RELATIVE_SIGMA * disparity))
+        points, covariances = make_points(
+            self.camera,
+            T_world_camera,
+            features.uv_px,
+            disparity,
+            _SIGMA_NEW_UV_PX,
+            sigma_disparity,
+        )
+        slopes = (T_world_camera[:3, 3] - points) / disparity[:, None]  # z = bf / d
+        colors = read_colors(view, features.uv_px)
+        ids = sparse_map.add_points(points, covariances, slopes, features.descriptors, colors)
+        return Tracks(
+            ids,
+            features.uv_px,
+            np.where(close, disparity, np.nan),
+            np.full(len(ids), _SIGMA_NEW_UV_PX),
+        )
+
+    def _add_keyframe(
+        self, sparse_map: SparseMap, view: View, tracked: TrackedFrame, tracks: Tracks
+    ) -> Tracks:
+        """Remember the frame; triangulate what has no point yet with its neighbours."""
+        free = view.features[self._away_from(view.features.uv_px, tracks.uv_px)]
+        T = tracked.T_world_camera
+        neighbours = sparse_map._candidate_keyframes(tracks.point_ids, T)[::-1]
+        for index in neighbours[: self.config.mapping.triangulate_with]:
+            new, used = self._triangulate_with(
+                sparse_map, sparse_map.keyframes[index], view, T, free
+            )
+            tracks = Tracks.concatenate(tracks, new)
+            free = free[~used]
+        sparse_map.add_keyframe(Keyframe(view.frame_index, view.timestamp_s, T, tracks, free))
+        return tracks
+
+    def _triangulate_with(
+        self, sparse_map: SparseMap, other: Keyframe, view: View, T: Array, free: Features
+    ) -> tuple[Tracks, NDArray[np.bool_]]:
+        """Points from the free features of this frame and of one keyframe."""
+        config = self.config.mapping
+        used = np.zeros(len(free), bool)
+        T_curr_other = np.linalg.inv(T) @ other.T_world_camera
+        i, j = match_along_epipolar_lines(
+            self.camera, T_curr_other, free, other.free_features, config.max_epipolar_px
+        )
+        if len(i) == 0:
+            return Tracks.empty(), used
+        a, b = free[i], other.free_features[j]
+        points = triangulate(self.camera, T, other.T_world_camera, a.uv_px, b.uv_px)
+        good = check_triangulated(self.camera, T, other.T_world_camera, points, a, b, config)
+        points, a = points[good], a[good]
+        used[i[good]] = True
+        ids = sparse_map.add_points(
+            points,
+            triangulation_covariance(self.camera, T, other.T_world_camera, points),
+            np.zeros_like(points),
+            a.descriptors,
+            read_colors(view, a.uv_px),
+        )
+        n = len(ids)
+        return Tracks(ids, a.uv_px, np.full(n, np.nan), np.full(n, _TRIANGULATED_SIGMA_PX)), used
+
+
+def triangulation_covariance(
+    camera: StereoCamera, T_world_a: Array, T_world_b: Array, points_world_m: Array
+) -> Array:
+    """Covariances (N, 3, 3) of two-view points, from the pixel noise in both images."""
+    information = np.zeros((len(points_world_m), 3, 3))
+    for T in (T_world_a, T_world_b):
+        points = transform_points(invert_T(T), points_world_m)
+        J = projection_jacobian(camera, points)[:, :2] @ T[:3, :3].T
+        information += J.transpose(0, 2, 1) @ J / _TRIANGULATED_SIGMA_PX**2
+    return np.linalg.inv(information + 1e-6 * np.eye(3))
+
+
+def read_colors(view: View, uv_px: Array) -> NDArray[np.uint8]:
+    """RGB colours (N, 3) of the image at pixels (N, 2)."""
+    H, W = view.gray.shape
+    x = np.clip(np.rint(uv_px[:, 0]).astype(np.int64), 0, W - 1)
+    y = np.clip(np.rint(uv_px[:, 1]).astype(np.int64), 0, H - 1)
+    values = view.image[y, x]
+    return values if values.ndim == 2 else np.repeat(values[:, None], 3, axis=1)

@@ -1,0 +1,227 @@
+"""The sparse static map: points with uncertainty, keyframes, and who sees what.
+
+Owns the storage of points (growing parallel arrays), covisibility and culling. It estimates
+nothing itself; `point_filter` and `triangulation` hold the formulas.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import MappingConfig
+from pipelines.frontend.disparity_offset import follow_camera
+from pipelines.frontend.motion_only_ba import StereoObservations
+from pipelines.geometry import invert_T, project_stereo, transform_points
+from pipelines.mapping.keyframe import Keyframe, Tracks
+from pipelines.types import Array, StaticMap, StereoCamera
+
+Ids = NDArray[np.int64]
+
+_COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {
+    "position_m": ((3,), np.float64),  # in the world
+    "covariance_m2": ((3, 3), np.float64),
+    "offset_slope": ((3,), np.float64),  # d position / d disparity offset, m / px
+    "descriptor": ((32,), np.uint8),
+    "color": ((3,), np.uint8),
+    "n_found": ((), np.int32),  # frames that observed the point
+    "n_visible": ((), np.int32),  # frames that should have
+    "n_keyframes": ((), np.int32),  # keyframes that observe it
+    "first_keyframe": ((), np.int64),  # position in `keyframes` of the first one, -1 before that
+    "alive": ((), np.bool_),
+}
+
+
+class SparseMap:
+    """Points and keyframes of the static world.
+
+    Attributes named in `_COLUMNS` are arrays of capacity N; a point's id is its row. Rows of points
+    that died before any keyframe saw them are used again.
+    """
+
+    position_m: Array
+    covariance_m2: Array
+    offset_slope: Array
+    descriptor: NDArray[np.uint8]
+    color: NDArray[np.uint8]
+    n_found: NDArray[np.int32]
+    n_visible: NDArray[np.int32]
+    n_keyframes: NDArray[np.int32]
+    first_keyframe: NDArray[np.int64]
+    alive: NDArray[np.bool_]
+
+    def __init__(self, camera: StereoCamera, config: MappingConfig) -> None:
+        self.camera, self.config = camera, config
+        self.keyframes: list[Keyframe] = []
+        self._covisible: list[Ids] = []  # per keyframe, its covisible ones, most shared first
+        self._size = 0
+        self._free = np.empty(0, np.int64)
+        for name, (shape, dtype) in _COLUMNS.items():
+            setattr(self, name, np.zeros((4096, *shape), dtype))
+
+    # ---------------------------------------------------------------- points
+
+    def add_points(
+        self,
+        points_world_m: Array,
+        covariances_m2: Array,
+        offset_slopes: Array,
+        descriptors: NDArray[np.uint8],
+        colors: NDArray[np.uint8],
+    ) -> Ids:
+        """Store new points, seen once so far, and return their ids (N,)."""
+        ids = self._allocate(len(points_world_m))
+        self.position_m[ids] = points_world_m
+        self.covariance_m2[ids] = covariances_m2
+        self.offset_slope[ids] = offset_slopes
+        self.descriptor[ids] = descriptors
+        self.color[ids] = colors
+        self.n_found[ids] = self.n_visible[ids] = 1
+        self.n_keyframes[ids] = 0
+        self.first_keyframe[ids] = -1
+        self.alive[ids] = True
+        return ids
+
+    def _allocate(self, n: int) -> Ids:
+        reused, self._free = self._free[:n], self._free[n:]
+        fresh = n - len(reused)
+        capacity = len(self.alive)
+        if self._size + fresh > capacity:
+            grown = max(2 * capacity, self._size + fresh)
+            for name in _COLUMNS:
+                old = getattr(self, name)
+                new = np.zeros((grown, *old.shape[1:]), old.dtype)
+                new[: self._size] = old[: self._size]
+                setattr(self, name, new)
+        ids = np.concatenate([reused, np.arange(self._size, self._size + fresh)])
+        self._size += fresh
+        return ids
+
+    def observe(self, tracks: Tracks, sigma_disparity_px: float) -> StereoObservations:
+        """The observations that the tracks make of their points."""
+        ids = tracks.point_ids
+        return StereoObservations(
+            self.position_m[ids],
+            self.covariance_m2[ids],
+            tracks.uvr_px,
+            tracks.sigma_uv_px,
+            np.full(len(ids), sigma_disparity_px),
+        )
+
+    def shift_offset(self, T_world_camera: Array, pose_slope: Array, step_px: float) -> None:
+        """Let all points follow a new disparity offset, with the present camera held still."""
+        used = slice(0, self._size)
+        self.offset_slope[used] += follow_camera(T_world_camera, self.position_m[used], pose_slope)
+        self.position_m[used] += step_px * self.offset_slope[used]
+
+    def record_sight(self, visible_ids: Ids, found_ids: Ids) -> None:
+        """Count which points a frame should have seen, and which it did see."""
+        self.n_visible[visible_ids] += 1
+        self.n_found[found_ids] += 1
+
+    def cull_points(self, tracked_ids: Ids) -> None:
+        """Forget points that proved no good: lost while young, or mostly not found where visible.
+
+        Points that no keyframe saw free their rows; others only die, as keyframes name them.
+        """
+        alive = np.flatnonzero(self.alive[: self._size])
+        tracked = np.zeros(self._size, bool)
+        tracked[tracked_ids] = True
+        young = self.n_keyframes[alive] == 0
+        finite = np.isfinite(self.position_m[alive]).all(1)
+        ratio = self.n_found[alive] / np.maximum(self.n_visible[alive], 1)
+        poor = (self.n_visible[alive] >= 8) & (ratio < self.config.min_found_ratio)
+        doomed = alive[(young & ~tracked[alive]) | (poor & ~tracked[alive]) | ~finite]
+        self.alive[doomed] = False
+        self._free = np.concatenate([self._free, doomed[self.n_keyframes[doomed] == 0]])
+
+    # ------------------------------------------------------------- keyframes
+
+    def add_keyframe(self, keyframe: Keyframe) -> None:
+        """Remember a keyframe, and work out which earlier ones see the same points."""
+        index = len(self.keyframes)
+        ids = keyframe.tracks.point_ids
+        new = ids[self.first_keyframe[ids] < 0]
+        shared = np.zeros(index, np.int64)
+        flags = np.zeros(self._size, bool)
+        flags[ids] = True
+        for other in self._candidate_keyframes(ids, keyframe.T_world_camera):
+            shared[other] = flags[self.keyframes[other].tracks.point_ids].sum()
+        covisible = np.flatnonzero(shared >= self.config.min_shared_points)
+        self._covisible.append(covisible[np.argsort(-shared[covisible], kind="stable")])
+        for other in covisible:
+            self._covisible[other] = np.append(self._covisible[other], index)
+        self.first_keyframe[new] = index
+        self.n_keyframes[ids] += 1
+        self.keyframes.append(keyframe)
+
+    def covisible_keyframes(self, index: int) -> Ids:
+        """Positions in `keyframes` of those that share points with keyframe `index`."""
+        return self._covisible[index]
+
+    def _candidate_keyframes(self, point_ids: Ids, T_world_camera: Array) -> Ids:
+        """Keyframes that may see these points: their first observers, those's neighbours, and
+        keyframes near in place and direction, which is where a path crosses itself."""
+        if not self.keyframes:
+            return np.empty(0, np.int64)
+        first = self.first_keyframe[point_ids]
+        votes = np.bincount(first[first >= 0], minlength=len(self.keyframes))
+        chosen = np.argsort(-votes, kind="stable")[: self.config.local_keyframes]
+        chosen = chosen[votes[chosen] > 0]
+        chosen = np.union1d(chosen, [len(self.keyframes) - 1])
+        neighbours = [self._covisible[k][:5] for k in chosen if k < len(self._covisible)]
+        near = self._near_keyframes(T_world_camera)
+        return np.unique(np.concatenate([chosen, near, *neighbours])).astype(np.int64)
+
+    def _near_keyframes(self, T_world_camera: Array) -> Ids:
+        """The keyframes nearest in place that look the same way, within sight of their points."""
+        Ts = np.stack([k.T_world_camera for k in self.keyframes])
+        distance = np.linalg.norm(Ts[:, :3, 3] - T_world_camera[:3, 3], axis=1)
+        cosine = Ts[:, :3, 2] @ T_world_camera[:3, 2]
+        reach = self.config.near_keyframe_baselines * self.camera.baseline_m
+        near = np.flatnonzero((distance < reach) & (cosine > np.cos(np.radians(40.0))))
+        return near[np.argsort(distance[near], kind="stable")[: self.config.local_keyframes]]
+
+    def local_points(self, T_world_camera: Array, tracked_ids: Ids) -> tuple[Ids, Array]:
+        """Points of the local map in view but not tracked: ids (N,) and predicted pixels (N, 2)."""
+        keyframes = self._candidate_keyframes(tracked_ids, T_world_camera)
+        flags = np.zeros(self._size, bool)
+        for index in keyframes:
+            flags[self.keyframes[index].tracks.point_ids] = True
+        flags &= self.alive[: self._size]
+        flags[tracked_ids] = False
+        ids = np.flatnonzero(flags)
+        points = transform_points(invert_T(T_world_camera), self.position_m[ids])
+        front = points[:, 2] > 0.1
+        ids, points = ids[front], points[front]
+        uv = project_stereo(self.camera, points)[:, :2]
+        inside = (
+            (uv[:, 0] > 0)
+            & (uv[:, 1] > 0)
+            & (uv[:, 0] < self.camera.width - 1)
+            & (uv[:, 1] < self.camera.height - 1)
+        )
+        return ids[inside], uv[inside]
+
+    # --------------------------------------------------------------- outside
+
+    def snapshot(self) -> StaticMap:
+        """The well-measured points and all keyframe poses, copied for the outside."""
+        ids = np.flatnonzero(self.alive[: self._size] & (self.n_keyframes[: self._size] > 0))
+        centres = np.stack([k.T_world_camera[:3, 3] for k in self.keyframes] or [np.zeros(3)])
+        nearest = centres[np.maximum(self.first_keyframe[ids], 0)]
+        distance = np.linalg.norm(self.position_m[ids] - nearest, axis=1)
+        spread = np.sqrt(np.trace(self.covariance_m2[ids], axis1=1, axis2=2))
+        good = (self.n_found[ids] >= self.config.min_observations) & (
+            spread < self.config.max_relative_depth_sigma * distance
+        )
+        ids = ids[good]
+        return StaticMap(
+            self.position_m[ids].copy(),
+            self.color[ids].copy(),
+            self.n_found[ids].copy(),
+            np.stack([k.T_world_camera for k in self.keyframes])
+            if self.keyframes
+            else np.empty((0, 4, 4)),
+            np.array([k.frame_index for k in self.keyframes], np.int64),
+        )
