@@ -23,7 +23,7 @@ class Atlas:
     def __init__(self, textures: list[Texture]) -> None:
         self._levels = [_reductions(t.rgba) for t in textures]
         self.tile_m = np.array([t.tile_m for t in textures], np.float32)
-        self.size_px = np.array([t.rgba.shape[1::-1] for t in textures], np.float32)
+        self.size_px = np.array([t.rgba.shape[1::-1] for t in textures], np.float32).T.copy()
         deepest = max(len(levels) for levels in self._levels)
         n = len(textures)
         self._count = np.array([len(levels) for levels in self._levels], np.int32)
@@ -55,12 +55,13 @@ class Atlas:
             picture[top : top + level.shape[0], left : left + level.shape[1]] = level
         return picture
 
-    def look_up(self, index: NDArray[np.int32], u: Array, v: Array, step_px: Array) -> Image:
-        """RGBA (N, 4) of textures `index` (N,) at (u, v) in tiles.
+    def look_up(self, index: NDArray[np.int32], u: Array, v: Array, step2_px: Array) -> Image:
+        """RGBA planes (4, N) of textures `index` (N,) at (u, v) in tiles.
 
-        step_px: (N,) distance in texels (of the full level) between neighbouring image pixels.
+        step2_px: (N,) squared distance in texels (of the full level) between neighbouring pixels.
         """
-        level = np.log2(np.maximum(step_px, 1.0)) + np.float32(0.35)
+        # log2 of a square is twice log2; 0.35 leans to the sharper side of the rounding.
+        level = np.float32(0.5) * np.log2(np.maximum(step2_px, 1.0)) + np.float32(0.35)
         level = np.minimum(level.astype(np.int32), self._count[index] - 1)
         slot = index * self._deepest + level
         x = (u - np.floor(u)) * self._w[slot] + self._x0[slot] - np.float32(0.5)
@@ -70,7 +71,8 @@ class Atlas:
         padded = np.zeros((2, rows * _ROW), np.float32)
         padded[0, :N], padded[1, :N] = x, y
         map_x, map_y = padded.reshape(2, rows, _ROW)
-        return cv2.remap(self._picture, map_x, map_y, cv2.INTER_LINEAR).reshape(-1, 4)[:N]
+        found = cv2.remap(self._picture, map_x, map_y, cv2.INTER_LINEAR)
+        return np.stack(cv2.split(found)).reshape(4, -1)[:, :N]
 
 
 def _reductions(rgba: Image) -> list[Image]:

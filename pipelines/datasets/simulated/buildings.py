@@ -193,12 +193,12 @@ def road_sign(kind: str) -> Mesh:
         rim = np.stack([0.34 * np.cos(angle), -2.4 + 0.34 * np.sin(angle), 0 * angle], 1)
         points = np.stack([np.broadcast_to((0, -2.4, 0), rim.shape), rim])
         uv = points[..., :2] - (0, -2.4) + 0.35
-        back = surface(points + (0, 0, 0.012), "plain", (150, 152, 154))
+        back = surface(points + np.array([0, 0, 0.012]), "plain", (150, 152, 154))
         return merge([post, surface(points, "sign_limit", uv=uv), back])
     face = [(-0.33, -2.73, 0), (0.33, -2.73, 0), (0.33, -2.07, 0), (-0.33, -2.07, 0)]
-    uv = [(0.01, 0.01), (0.69, 0.01), (0.69, 0.69), (0.01, 0.69)]
-    back = quad(np.array(face) + (0, 0, 0.012), "plain", (150, 152, 154))
-    return merge([post, quad(face, f"sign_{kind}", WHITE, uv), back])
+    corners = [(0.01, 0.01), (0.69, 0.01), (0.69, 0.69), (0.01, 0.69)]
+    back = quad(np.array(face) + np.array([0, 0, 0.012]), "plain", (150, 152, 154))
+    return merge([post, quad(face, f"sign_{kind}", WHITE, corners), back])
 
 
 def traffic_light() -> Mesh:

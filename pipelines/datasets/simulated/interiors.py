@@ -6,7 +6,6 @@ Owns textures that show indoor things; plain wood, cloth and wallpaper are in `t
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 
@@ -27,9 +26,10 @@ def _landscape(rng: np.random.Generator) -> Texture:
     canvas.fade((0.04, 0.04, 0.76, 0.56), (92, 146, 196), (244, 216, 168))
     canvas.ellipse((0.56, 0.2), (0.055, 0.055), (252, 236, 180))
     for base, colour in ((0.27, (112, 132, 152)), (0.33, (84, 112, 110)), (0.4, (66, 96, 62))):
-        x = np.linspace(0.04, 0.76, 24)
-        y = base + 0.05 * np.sin(x * 9 + base * 40) + 0.03 * np.sin(x * 23 + base * 90)
-        canvas.polygon([*zip(x, y, strict=True), (0.76, 0.56), (0.04, 0.56)], colour)
+        along = np.linspace(0.04, 0.76, 24)
+        ridge = base + 0.05 * np.sin(along * 9 + base * 40) + 0.03 * np.sin(along * 23 + base * 90)
+        foot = np.array([(0.76, 0.56), (0.04, 0.56)])
+        canvas.polygon(np.concatenate([np.stack([along, ridge], 1), foot]), colour)
     canvas.fade((0.04, 0.47, 0.76, 0.56), (120, 152, 168), (64, 96, 122))
     for x in (0.12, 0.17, 0.24, 0.66, 0.71):
         height = rng.uniform(0.08, 0.14)
@@ -43,8 +43,9 @@ def _still_life(rng: np.random.Generator) -> Texture:
     canvas = Canvas((256, 256), PICTURE_M, (164, 132, 70))
     canvas.fade((0.04, 0.04, 0.76, 0.4), (70, 62, 58), (120, 96, 78))
     canvas.fade((0.04, 0.4, 0.76, 0.56), (156, 110, 70), (112, 74, 46))
-    canvas.polygon([(0.34, 0.46), (0.3, 0.34), (0.35, 0.28), (0.43, 0.28), (0.48, 0.34), (0.44, 0.46)],
-                   (72, 104, 144))  # fmt: skip
+    half_vase = np.array([(0.05, 0.46), (0.09, 0.34), (0.04, 0.28)])
+    other_half = half_vase[::-1] * (-1, 1)
+    canvas.polygon(np.concatenate([half_vase, other_half]) + np.array([0.39, 0]), (72, 104, 144))
     for _ in range(16):
         at = np.array([0.39, 0.2]) + rng.normal(0, (0.075, 0.05))
         canvas.line([(0.39, 0.29), tuple(at)], (62, 92, 52), 0.008)
@@ -122,7 +123,8 @@ def _cardboard(rng: np.random.Generator) -> Texture:
         (0, 0, 0.006, 0.5),
         (0.494, 0, 0.5, 0.5),
     ):
-        canvas.rect(*edge, (140, 104, 66))
+        x0, y0, x1, y1 = edge
+        canvas.rect(x0, y0, x1, y1, (140, 104, 66))
     return canvas.texture(rng, 0.035)
 
 
@@ -234,6 +236,15 @@ def _poster(rng: np.random.Generator) -> Texture:
     return canvas.texture(rng, 0.03)
 
 
+def _curtain(rng: np.random.Generator) -> Texture:
+    canvas = Canvas((256, 64), (0.8, 0.4), (255, 255, 255, 255))
+    for i in range(10):
+        x = i * 0.08
+        canvas.rect(x, 0, x + 0.03, 0.4, (206, 206, 206, 255))
+        canvas.rect(x + 0.03, 0, x + 0.045, 0.4, (170, 170, 170, 255))
+    return canvas.texture(rng, 0.05)
+
+
 INTERIORS: dict[str, Callable[[np.random.Generator], Texture]] = {
     "landscape": _landscape,
     "still_life": _still_life,
@@ -246,14 +257,5 @@ INTERIORS: dict[str, Callable[[np.random.Generator], Texture]] = {
     "ball": _ball,
     "door": _door,
     "window_view": _window_view,
-    "curtain": partial(lambda rng: _curtain(rng)),
+    "curtain": _curtain,
 }
-
-
-def _curtain(rng: np.random.Generator) -> Texture:
-    canvas = Canvas((256, 64), (0.8, 0.4), (255, 255, 255, 255))
-    for i in range(10):
-        x = i * 0.08
-        canvas.rect(x, 0, x + 0.03, 0.4, (206, 206, 206, 255))
-        canvas.rect(x + 0.03, 0, x + 0.045, 0.4, (170, 170, 170, 255))
-    return canvas.texture(rng, 0.05)

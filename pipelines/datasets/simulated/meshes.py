@@ -209,7 +209,7 @@ def cylinder(
 ) -> Mesh:
     """Round bar, cone or tapered limb between two points, smoothly shaded."""
     a, b = np.asarray(start, float), np.asarray(end, float)
-    across, along = _across(b - a, sides)
+    across = _across(b - a, sides)
     rings = np.stack([a + radii[0] * across, b + radii[1] * across])
     parts = [surface(rings, texture, tint, smooth=True)]
     if caps:
@@ -221,15 +221,15 @@ def cylinder(
     return merge(parts)
 
 
-def _across(axis: Array, sides: int) -> tuple[Array, Array]:
-    """Closed ring (sides + 1, 3) of unit vectors across `axis`, and the unit axis."""
+def _across(axis: Array, sides: int) -> Array:
+    """Closed ring (sides + 1, 3) of unit vectors across `axis`."""
     along = axis / np.linalg.norm(axis)
     other = np.array([1.0, 0, 0]) if abs(along[0]) < 0.9 else np.array([0, 1.0, 0])
     e1 = np.cross(along, other)
     e1 /= np.linalg.norm(e1)
     e2 = np.cross(along, e1)
     angle = np.linspace(0, 2 * np.pi, sides + 1)
-    return np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2, along
+    return np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2
 
 
 def ellipsoid(

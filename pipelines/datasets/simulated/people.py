@@ -58,7 +58,7 @@ def walker_mesh(clothes: Clothes, height_m: float = 1.74) -> Mesh:
         parts.append(ellipsoid((0.05, 0.05, 0.135), "plain", clothes.shoes, foot, 6, 10))
         shoulder, elbow = (side * 0.215, -1.4, 0), (side * 0.27, -1.13, -swing * 0.09 - 0.02)
         wrist = (side * 0.26, -0.92, -swing * 0.19 + 0.08)
-        parts.append(limb([shoulder, elbow], (0.072, 0.055), top, clothes.top, 10))
+        parts.append(limb([shoulder, elbow], (0.062, 0.052), top, clothes.top, 10))
         parts.append(limb([elbow, wrist], (0.048, 0.036), "plain", skin, 8))
         hand = (wrist[0], wrist[1] + 0.06, wrist[2] + 0.02)
         parts.append(ellipsoid((0.03, 0.065, 0.045), "plain", skin, hand, 6, 8))

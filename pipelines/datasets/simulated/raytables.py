@@ -19,11 +19,11 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class TriangleTable:
-    """A mesh in the form that shading reads (parallel arrays of length M).
+    """A mesh in the form that shading reads (parallel arrays).
 
     normal: (M, 3) of the plane. corner: (M, 3) one corner. corner_tiles: (M, 2) its texture
     coordinates in tiles. gradient_tiles: (M, 2, 3) change of them per metre. texture: (M,) index.
-    tint: (M, 3) 0-1. corner_normals: (M, 3, 3) smooth normals. dual: (M, 2, 3) turns an offset
+    tint: (3, M) 0-1. corner_normals: (M, 3, 3) smooth normals. dual: (M, 2, 3) turns an offset
     from the corner into weights of the other two corners.
     """
 
@@ -56,7 +56,7 @@ class TriangleTable:
             tiles[:, 0],
             gradient,
             texture,
-            (mesh.tint / 255).astype(np.float32),
+            _contiguous(mesh.tint.T / 255),
             mesh.normals.astype(np.float32),
             np.stack([b1, b2], 1).astype(np.float32),
         )

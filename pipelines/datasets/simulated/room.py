@@ -29,6 +29,7 @@ from pipelines.datasets.simulated.world import Actor, Light, World
 from pipelines.geometry import make_T
 from pipelines.types import Array, StereoCamera
 
+Triple = tuple[float, float, float]
 FPS = 20.0
 _WALL_X, _BACK, _FRONT, _HEIGHT = 3.1, 4.9, -2.4, 2.6
 
@@ -45,7 +46,7 @@ def make_room(frames: int, seed: int, camera: StereoCamera, fps: float = FPS) ->
         tuple(_actors(times, phase, rng)),
         _camera_path(times, phase),
         Light(
-            (0.22, -1.0, -0.3), (0.52, 0.48, 0.41), (0.74, 0.72, 0.67), (0.64, 0.6, 0.55),
+            (0.22, -1.0, -0.3), (0.52, 0.48, 0.41), (0.8, 0.77, 0.72), (0.72, 0.68, 0.62),
             shadow_texel_m=0.02, shadow_blur_texels=4.0, ceiling_m=-2.3, patch_drop_m=1.1,
             haze_m=None,
         ),
@@ -76,15 +77,21 @@ def _tumble(t: Array, centre: Array, sway: Array, spin: Array, phase: float) -> 
 
 
 def _actors(t: Array, phase: Array, rng: np.random.Generator) -> list[Actor]:
-    wide = np.array([0.32, 0.14, 0.22])
+    def floating(centre: Triple, sway: Triple, spin: Triple, k: int) -> Array:
+        return _tumble(t, np.array(centre), np.array(sway), np.array(spin), phase[k])
+
+    wide = (0.32, 0.14, 0.22)
+    parcel, flat = carton((0.34, 0.34, 0.34), "gift", 0.4), (0.32, 0.14, 0.09)
     things: list[tuple[str, Mesh, Array, bool]] = [
-        ("box", carton((0.5, 0.38, 0.42)),
-         _tumble(t, np.array([-0.95, -1.3, 1.9]), wide, np.array([0.8, 0.9, 0.35]), phase[1]), True),
-        ("box", toy_block(),
-         _tumble(t, np.array([0.75, -1.5, 1.9]), wide, np.array([-0.9, 1.1, 0.4]), phase[2]), True),
-        ("box", carton((0.34, 0.34, 0.34), "gift", 0.4),
-         _tumble(t, np.array([-0.75, -0.62, 2.95]), wide * (1, 1, 0.4), np.array([0.6, 0.7, -0.5]), phase[3]), True),
-    ]  # fmt: skip
+        (
+            "box",
+            carton((0.5, 0.38, 0.42)),
+            floating((-0.95, -1.3, 1.9), wide, (0.8, 0.9, 0.35), 1),
+            True,
+        ),
+        ("box", toy_block(), floating((0.75, -1.5, 1.9), wide, (-0.9, 1.1, 0.4), 2), True),
+        ("box", parcel, floating((-0.75, -0.62, 2.95), flat, (0.6, 0.7, -0.5), 3), True),
+    ]
     things.append(("chair", *_on_the_floor(chair((66, 118, 106)), _pulled_chair(t)), True))
     things.append(
         ("chair", *_on_the_floor(chair(), np.array([pose(0.7, 0, 3.22, 0.15)] * len(t))), False)
@@ -161,7 +168,7 @@ def _shell() -> list[Mesh]:
         quad([(X, -H, F), (-X, -H, F), (-X, 0, F), (X, 0, F)], "wallpaper", green),
         quad([(-X, -H, F), (-X, -H, B), (-X, 0, B), (-X, 0, F)], "wallpaper", cream),
         quad([(X, -H, B), (X, -H, F), (X, 0, F), (X, 0, B)], "wallpaper", cream),
-        quad([(-X, -H, F), (X, -H, F), (X, -H, B), (-X, -H, B)], "plain", (400, 394, 380)),
+        quad([(-X, -H, F), (X, -H, F), (X, -H, B), (-X, -H, B)], "plain", (365, 358, 342)),
         quad(floor, "floor_boards", (214, 164, 112)),
     ]
     white = (240, 238, 230)

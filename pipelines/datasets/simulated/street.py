@@ -116,7 +116,7 @@ def make_street(
         _static(road, rng),
         tuple(script.actors),
         _camera_path(road, times),
-        Light((-0.62, -1.0, -0.55), (0.72, 0.67, 0.57), (0.68, 0.72, 0.79), (0.44, 0.42, 0.4)),
+        Light((-0.62, -1.0, -0.55), (0.78, 0.73, 0.63), (0.75, 0.78, 0.84), (0.5, 0.48, 0.45)),
         SURFACES | FACADES | VEHICLE_ART,
         sky="sky",
     )

@@ -96,7 +96,7 @@ def _asphalt(rng: np.random.Generator) -> Texture:
     stones = grain(size, rng, 0.8)
     light = 1 + 0.13 * stones + 0.05 * fractal_noise(size, rng, 3)
     light += 0.35 * np.clip(grain(size, rng, 1.1) - 2.1, 0, 2)  # pale chippings
-    rgba = coloured((104, 104, 107), light)
+    rgba = coloured((112, 112, 114), light)
     for _ in range(5):  # cracks, and the patches of old repairs
         walk = rng.normal((0, 0), (11, 11), (60, 2)) + rng.normal(0, 7, 2)
         line = (rng.uniform(0, size, 2) + walk.cumsum(0)).astype(np.int32)
@@ -206,7 +206,7 @@ def _stripes(rng: np.random.Generator) -> Texture:
 
 
 def _plain(rng: np.random.Generator) -> Texture:
-    light = 0.96 + 0.03 * grain(128, rng, 1.0) + 0.03 * fractal_noise(128, rng, 2)
+    light = 0.965 + 0.028 * grain(128, rng, 1.0) + 0.016 * fractal_noise(128, rng, 4)
     return Texture(coloured((245, 245, 245), light, tinted=1.0), (1.0, 1.0))
 
 
@@ -222,7 +222,7 @@ def _paint(rng: np.random.Generator) -> Texture:
 
 
 def _concrete(rng: np.random.Generator) -> Texture:
-    y, x = np.mgrid[:256, :256]
+    x = np.mgrid[:256, :256][1]
     light = 0.95 + 0.07 * grain(256, rng) + 0.06 * fractal_noise(256, rng)
     light[x < 4] *= 0.6
     return Texture(coloured((176, 172, 165), light), (1.0, 1.0))
@@ -242,8 +242,8 @@ def _rug(rng: np.random.Generator) -> Texture:
         np.meshgrid(np.arange(104, 460, 76), np.arange(104, 460, 76)), -1
     ).reshape(-1, 2):
         diamond = (centre + np.array([(0, -30), (30, 0), (0, 30), (-30, 0)])).astype(np.int32)
-        colour = ((226, 204, 160, 0), (44, 56, 92, 0), (196, 140, 60, 0))[centre.sum() // 76 % 3]
-        cv2.fillPoly(rgba, [diamond], colour, cv2.LINE_AA)
+        colour = ((226, 204, 160), (44, 56, 92), (196, 140, 60))[centre.sum() // 76 % 3]
+        cv2.fillPoly(rgba, [diamond], (*colour, 0), cv2.LINE_AA)
         cv2.circle(rgba, tuple(int(c) for c in centre), 9, (120, 30, 34, 0), -1, cv2.LINE_AA)
     rgba = np.clip(rgba * (1 + 0.05 * grain(size, rng))[..., None], 0, 255).astype(np.uint8)
     rgba[..., 3] = 0

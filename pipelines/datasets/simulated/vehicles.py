@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
@@ -196,7 +197,7 @@ def _side_art(rng: np.random.Generator, shape: CarShape) -> Texture:
     edges = shape.glass_z
     low = shape.belt_m + 0.03
     canvas.polygon(_pane(shape, edges[0] - 0.04, edges[-1] + 0.05, low - 0.03, 0.05), _BLACK)
-    for rear, front in zip(edges[:-1], edges[1:], strict=True):
+    for rear, front in pairwise(edges):
         if front - rear < 0.2:
             continue
         pane = np.array(_pane(shape, rear + 0.04, front - 0.04, low, 0.1))
@@ -264,12 +265,12 @@ def _above_art(rng: np.random.Generator, shape: CarShape) -> Texture:
         y = middle + side * half * 0.62
         canvas.line(
             [(hood + _LONG / 2, y), (shape.size_m[2] / 2 + _LONG / 2, y * 0.98)],
-            (205,) * 3 + (255,),
+            (205, 205, 205, 255),
             0.02,
         )
         y = middle + side * half * 0.68
         canvas.line(
-            [(roof.min() + _LONG / 2, y), (roof.max() + _LONG / 2, y)], (150,) * 3 + (255,), 0.03
+            [(roof.min() + _LONG / 2, y), (roof.max() + _LONG / 2, y)], (150, 150, 150, 255), 0.03
         )
     return canvas.texture(rng, 0.015)
 
@@ -316,7 +317,7 @@ def _wheel_art(rng: np.random.Generator) -> Texture:
     canvas.ellipse(centre, (0.36, 0.36), (178, 180, 184))
     canvas.ellipse(centre, (0.32, 0.32), (52, 54, 58))
     for angle in np.arange(5) * 2 * np.pi / 5:
-        tip = np.array(centre) + 0.33 * np.array([np.sin(angle), -np.cos(angle)])
+        tip = (0.5 + 0.33 * np.sin(angle), 0.5 - 0.33 * np.cos(angle))
         canvas.line([centre, tip], (186, 188, 192), 0.075)
     canvas.ellipse(centre, (0.09, 0.09), (150, 152, 156))
     return canvas.texture(rng, 0.03)

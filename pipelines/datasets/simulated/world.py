@@ -6,7 +6,7 @@ Owns the nouns that scenes make and the renderer reads; the true poses come from
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,9 +35,11 @@ class Actor:
 class Light:
     """One far lamp and what comes from all around; colours are RGB factors.
 
-    towards: (3,) direction to the lamp in the scene. shadow_texel_m, shadow_blur_texels: sharpness
+    towards: (3,) direction to the lamp in the scene. lamp, above, below: its colour, and that of
+    the light from the sky and back from the ground. shadow_texel_m, shadow_blur_texels: sharpness
     of the shadows of what stands still. ceiling_m: whatever lies above this height (y below it)
-    casts no shadow. patch_drop_m: how far below a movable thing its dark patch reaches. haze_m: distance at which the air hides 63 %, None indoors.
+    casts no shadow. patch_drop_m: how far below a movable thing its dark patch reaches.
+    haze_m: distance at which the air hides 63 %, None indoors.
     """
 
     towards: tuple[float, float, float]
@@ -68,7 +70,6 @@ class World:
     textures: dict[str, Callable[[np.random.Generator], Texture]]
     sky: str | None = None
     reach_m: float = 150.0
-    tags: dict[str, float] = field(default_factory=dict)
 
     @property
     def n_frames(self) -> int:
