@@ -42,7 +42,7 @@ VERBS = {
 run DATA                        # the layout is guessed from the folder
 run DATA --dataset tum_rgbd --frames 100 --stride 2
 run simulated:street --degrade --seed 7
-run DATA --set orb.n_features=1500 --output my_results""",
+run DATA --set orb.n_features=1500 --output my_result""",
     ),
     "eval": Verb(
         "app.runs:evaluate",
@@ -194,7 +194,16 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_output(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--output", metavar="DIR", help="where results go (default: results/)")
+    parser.add_argument(
+        "--output", metavar="DIR", help="result folder (default: a new one in results/)"
+    )
+    parser.add_argument(
+        "--pictures",
+        type=_not_negative,
+        default=1,
+        metavar="N",
+        help="annotate every N-th frame in frames/ (default: 1; 0: none, for timing)",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bar and no tables")
 
 

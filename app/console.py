@@ -37,7 +37,7 @@ class Progress:
         self._n_frames = self._done = self._lost = 0
         self._started_s = self._printed_s = 0.0
 
-    def start(self, sequence: Any, n_frames: int, config: Any) -> None:
+    def start(self, sequence: Any, n_frames: int, config: Any, folder: Any) -> None:
         self._n_frames = n_frames
         self._started_s = self._printed_s = time.monotonic()
         camera = sequence.camera

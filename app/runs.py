@@ -30,7 +30,7 @@ def run(arguments: Namespace) -> int:
             options["progress"] = progress
         sequence = open_sequence(arguments.path, arguments.dataset, arguments.sequence, **options)
     span = {"start": arguments.start, "frames": arguments.frames, "stride": arguments.stride}
-    result = _process(sequence, config, arguments.output, arguments.quiet, span)
+    result = _process(sequence, config, arguments, span)
     folder = console.shorten(result.folder)
     if arguments.quiet:
         console.say(folder)
@@ -49,13 +49,15 @@ def demo(arguments: Namespace) -> int:
     with console.counting("rendering the scene", quiet) as progress:
         sequence = open_sequence(f"{SIMULATED}:demo", progress=progress)
     span = {"frames": arguments.frames}
-    result = _process(sequence, load_config(), arguments.output, quiet, span)
+    result = _process(sequence, load_config(), arguments, span)
     if result.metrics["run"]["interrupted"]:
         return INTERRUPTED
     with console.working("drawing the map and the trajectory", quiet):
         pictures = render_result(result.folder)
     console.pictures(pictures)
     if not quiet:
+        if arguments.pictures:
+            console.say(f"{console.shorten(result.folder / 'frames')}/ with each frame annotated")
         console.next_steps(
             {
                 "your own data": "run PATH",
@@ -95,13 +97,16 @@ def render(arguments: Namespace) -> int:
     return 0
 
 
-def _process(sequence: Any, config: Any, output: str | None, quiet: bool, span: dict) -> Any:
+def _process(sequence: Any, config: Any, arguments: Namespace, span: dict[str, Any]) -> Any:
     from pipelines.run import run as run_sequence
+    from viz.overlay import FrameWriter
 
-    sinks = () if quiet else (console.Progress(),)
+    sinks: list[Any] = [] if arguments.quiet else [console.Progress()]
+    if arguments.pictures:
+        sinks.append(FrameWriter(every=arguments.pictures))
     with console.warnings():
-        result = run_sequence(sequence, config, output, **span, sinks=sinks)
-    if not quiet:
+        result = run_sequence(sequence, config, arguments.output, **span, sinks=sinks)
+    if not arguments.quiet:
         console.metrics(result.metrics, result.timings, console.shorten(result.folder))
     return result
 

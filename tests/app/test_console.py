@@ -34,7 +34,7 @@ def screen(request, monkeypatch) -> io.StringIO:
 
 def test_progress_counts_frames_and_losses(screen) -> None:
     bar = console.Progress()
-    bar.start(SEQUENCE, 3, None)
+    bar.start(SEQUENCE, 3, None, None)
     for status in (TrackingStatus.OK, TrackingStatus.LOST, TrackingStatus.OK):
         bar.frame(None, SimpleNamespace(status=status))
     bar.finish()
@@ -46,7 +46,7 @@ def test_progress_counts_frames_and_losses(screen) -> None:
 
 def test_a_run_that_ends_early_closes_the_bar(screen) -> None:
     bar = console.Progress()
-    bar.start(SEQUENCE, 3, None)
+    bar.start(SEQUENCE, 3, None, None)
     bar.finish()
     bar.finish()
 

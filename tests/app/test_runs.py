@@ -51,7 +51,14 @@ def test_flags_reach_the_run(calls) -> None:
     assert calls["span"] == {"start": 2, "frames": 5, "stride": 3}
     assert calls["output"] == "out"
     assert calls["config"].orb.n_features == 900
-    assert isinstance(calls["sinks"][0], console.Progress)
+    assert [type(sink).__name__ for sink in calls["sinks"]] == ["Progress", "FrameWriter"]
+
+
+def test_pictures_of_frames_can_be_thinned_out_or_left_out(calls) -> None:
+    runs.run(words("run data --pictures 5"))
+    assert calls["sinks"][1].every == 5
+    runs.run(words("run data --pictures 0"))
+    assert [type(sink).__name__ for sink in calls["sinks"]] == ["Progress"]
 
 
 def test_the_seed_reaches_settings_and_simulation(calls) -> None:
@@ -80,8 +87,8 @@ def test_wrong_settings_are_found_before_the_data_are_opened(calls) -> None:
 
 
 def test_quiet_prints_the_folder_alone(calls, capsys, tmp_path) -> None:
-    assert runs.run(words("run data --quiet")) == 0
-    assert calls["sinks"] == ()
+    assert runs.run(words("run data --quiet --pictures 0")) == 0
+    assert calls["sinks"] == []
     assert capsys.readouterr().out == f"{tmp_path}\n"
 
 

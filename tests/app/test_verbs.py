@@ -28,11 +28,10 @@ def app(*words: str | Path) -> subprocess.CompletedProcess[str]:
 @pytest.fixture(scope="module")
 def result(tmp_path_factory) -> Path:
     """The folder of one short run."""
-    output = tmp_path_factory.mktemp("results")
-    done = app("run", "simulated:demo", "--frames", N_FRAMES, "--output", output, "--quiet")
+    folder = tmp_path_factory.mktemp("results") / "short"
+    done = app("run", "simulated:demo", "--frames", N_FRAMES, "--output", folder, "--quiet")
     assert done.returncode == 0, done.stdout + done.stderr
-    folder = Path(done.stdout.strip())
-    assert folder == (output / "latest").resolve()
+    assert Path(done.stdout.strip()) == folder
     return folder
 
 
@@ -50,6 +49,11 @@ def test_run_counts_what_it_did(result: Path) -> None:
     counts = json.loads((result / "metrics.json").read_text())["run"]
     assert (counts["frames"], counts["tracked"], counts["lost"]) == (N_FRAMES, N_FRAMES, 0)
     assert counts["interrupted"] is False
+
+
+def test_run_annotates_each_frame(result: Path) -> None:
+    names = [file.name for file in sorted((result / "frames").iterdir())]
+    assert names == [f"{index:06d}.png" for index in range(N_FRAMES)]
 
 
 def test_eval_restores_metrics_that_were_lost(result: Path) -> None:
@@ -77,24 +81,27 @@ def test_render_draws_pictures_of_the_size_asked_for(result: Path) -> None:
 
 
 def test_ctrl_c_leaves_a_valid_partial_result(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "app", "run", "simulated:demo", "--output", str(tmp_path)]
+    folder = tmp_path / "partial"
+    command = [sys.executable, "-m", "app", "run", "simulated:demo", "--output", str(folder)]
     with subprocess.Popen(
         command, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as running:
+        log = folder / "run.log"
         deadline = time.monotonic() + 120
-        while not (tmp_path / "latest").exists():
-            assert running.poll() is None, "ended before it made a result folder"
-            assert time.monotonic() < deadline, "made no result folder"
-            time.sleep(0.05)
-        time.sleep(1.0)
+        while not (log.exists() and "frame 2 " in log.read_text()):
+            assert running.poll() is None, "ended before its third frame"
+            assert time.monotonic() < deadline, "did not reach its third frame"
+            time.sleep(0.01)
         running.send_signal(signal.SIGINT)
-        running.communicate(timeout=120)
-    counts = json.loads((tmp_path / "latest" / "metrics.json").read_text())["run"]
-    if running.returncode == 0:
+        said = running.communicate(timeout=120)[0].decode()
+    counts = json.loads((folder / "metrics.json").read_text())["run"]
+    if running.returncode == 0 and counts["frames"] == 40:
         pytest.skip("the run had finished before the signal came")
     assert running.returncode == 130
+    assert "Stopped before the end" in said
     assert counts["interrupted"] is True
-    lines = (tmp_path / "latest" / "camera_tum.txt").read_text().splitlines()
+    assert 3 <= counts["frames"] < 40
+    lines = (folder / "camera_tum.txt").read_text().splitlines()
     assert len([line for line in lines if line[0] != "#"]) == counts["tracked"]
 
 
