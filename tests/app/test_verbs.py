@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("pipelines.run")
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "DYOB_NO_SETUP": "1"}
 N_FRAMES = 5
