@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from pipelines.errors import DyObError
 from pipelines.io.files import replacing
+from pipelines.io.folder import FRAMES
 from pipelines.io.timings import frame_total_ms
 from pipelines.types import Array, Frame, FrameResult, Image, TrackingStatus
 from viz import style
@@ -160,17 +161,19 @@ class FrameWriter:
 
     WAITING = 32
 
-    def __init__(self, folder: Path | str, every: int = 1, suffix: str = ".jpg") -> None:
+    def __init__(self, every: int = 1, suffix: str = ".png") -> None:
         if every < 1:
             raise ValueError(f"FrameWriter: expected every >= 1, found {every}")
-        self.folder, self.every, self.suffix = Path(folder), every, suffix
+        self.every, self.suffix = every, suffix
+        self.folder = Path()
         self._queue: queue.Queue[tuple[Frame, FrameResult] | None] = queue.Queue(self.WAITING)
         self._thread: threading.Thread | None = None
         self._failed = False
 
-    def start(self, sequence: Any, n_frames: int, config: Any) -> None:
-        """Make the folder and start the thread; the arguments are the sinks' contract."""
-        del sequence, n_frames, config
+    def start(self, sequence: Any, n_frames: int, config: Any, folder: Path) -> None:
+        """Make `frames` in the result folder and start the thread."""
+        del sequence, n_frames, config  # the sinks' contract
+        self.folder = folder / FRAMES
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -213,7 +216,8 @@ def write_image(path: Path | str, image: Image, *, sync: bool = True) -> None:
     import cv2
 
     path = Path(path)
-    options = [cv2.IMWRITE_JPEG_QUALITY, 92] if path.suffix in (".jpg", ".jpeg") else []
+    fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+    options = [cv2.IMWRITE_JPEG_QUALITY, 92] if path.suffix in (".jpg", ".jpeg") else fast
     try:
         ok, data = cv2.imencode(path.suffix, np.ascontiguousarray(image[..., ::-1]), options)
     except cv2.error:

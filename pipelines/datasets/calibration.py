@@ -78,7 +78,16 @@ def settings_size(settings: Settings, source: Path, prefix: str = "") -> Size | 
     return None if width is None or height is None else (int(width), int(height))
 
 
-def make_camera(size: Size, fx: float, fy: float, cx: float, cy: float, bf: float, source: Path):
+def make_camera(
+    size: Size,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    bf: float,
+    source: Path,
+    is_rgbd: bool = False,
+) -> StereoCamera:
     """A StereoCamera; raises DatasetError where the numbers cannot be a camera's."""
     width, height = size
     if min(fx, fy, bf) <= 0 or not (0 < cx < width and 0 < cy < height):
@@ -87,7 +96,8 @@ def make_camera(size: Size, fx: float, fy: float, cx: float, cy: float, bf: floa
             f"{width} x {height}, found fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}, bf {bf:g}; "
             "correct the calibration."
         )
-    return StereoCamera(width, height, *(float(value) for value in (fx, fy, cx, cy, bf)))
+    fx, fy, cx, cy, bf = (float(value) for value in (fx, fy, cx, cy, bf))
+    return StereoCamera(width, height, fx, fy, cx, cy, bf, is_rgbd)
 
 
 def read_camera_yaml(path: Path) -> dict[str, str]:

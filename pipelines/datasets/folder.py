@@ -79,7 +79,8 @@ class FolderSequence(FileSequence):
                 "pair, found neither; add one."
             )
         size = common_image_size(list(images.values()), settings_size(settings, yaml), str(yaml))
-        camera = make_camera(size, fx, fy, cx, cy, bf or RGBD_BF, yaml)
+        is_rgbd = bf is None  # a baseline that is stated is that of a real pair
+        camera = make_camera(size, fx, fy, cx, cy, bf or RGBD_BF, yaml, is_rgbd)
         fps = fps or number(settings, "fps", yaml)
         times_s = frame_times(root / "times.txt", fps, len(images), root)
         scale = depth_scale or number(settings, "depth_scale", yaml)

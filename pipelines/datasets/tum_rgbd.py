@@ -99,7 +99,7 @@ class TumRgbdSequence(FileSequence):
         bf = bf or bf_of(settings, yaml) or RGBD_BF
         if settings:
             fx, fy, cx, cy = required(settings, ("fx", "fy", "cx", "cy"), yaml)
-            return make_camera(size, fx, fy, cx, cy, bf, yaml)
+            return make_camera(size, fx, fy, cx, cy, bf, yaml, is_rgbd=True)
         matrix = first_file(
             root, ("camera-intrinsics*color*.txt", "camera-intrinsics.txt", "intrinsics.txt")
         )
@@ -107,10 +107,11 @@ class TumRgbdSequence(FileSequence):
             K = read_matrix(matrix)
             if K.shape != (3, 3):
                 raise DatasetError(f"{matrix}: expected a 3 x 3 matrix, found {K.shape}.")
-            return make_camera(size, K[0, 0], K[1, 1], K[0, 2], K[1, 2], bf, matrix)
+            fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+            return make_camera(size, fx, fy, cx, cy, bf, matrix, is_rgbd=True)
         for pattern, values in PUBLIC_CAMERAS.items():
             if size == PUBLIC_SIZE and re.search(pattern, str(root.resolve())):
-                return make_camera(size, *values, bf, root)
+                return make_camera(size, *values, bf, root, is_rgbd=True)
         raise tree_error(
             cls.dataset, cls.layout, root, "missing calibration", f"Add {CAMERA_YAML}."
         )

@@ -101,10 +101,11 @@ class VdoSequence(FileSequence):
         coding = None
         if not stereo:
             coding = depth_coding(list(depths.values()), values, source, depth_form, depth_factor)
+        is_rgbd = number(values, "ChooseData", source) == OMD_DATA
         fps = fps or number(values, "Camera.fps", source)
         return cls(
             root,
-            make_camera(size, fx, fy, cx, cy, bf, source),
+            make_camera(size, fx, fy, cx, cy, bf, source, is_rgbd),
             frame_times(root / "times.txt", fps, len(images), root),
             _frame_files(root, images, stereo),
             coding,

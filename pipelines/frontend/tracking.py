@@ -236,7 +236,9 @@ class Tracker:
         """Pose by descriptors alone, against the points of the latest keyframes."""
         name = MotionHypothesis.RELOCALISATION
         recent = sparse_map.keyframes[-_RELOCALISE_AGAINST:]
-        ids = np.unique(np.concatenate([k.tracks.point_ids for k in recent] or [[]])).astype(int)
+        if not recent:
+            return name, None
+        ids = np.unique(np.concatenate([k.tracks.point_ids for k in recent]))
         ids = ids[sparse_map.alive[ids]]
         points, features = match_all(
             sparse_map.descriptor[ids], view.features.descriptors, self.config.max_hamming, 0.8
@@ -262,7 +264,7 @@ class Tracker:
         last = self._last_tracks
         flow_uv = self._flow_places(view, last)
         start = self._predicted_places(view, sparse_map, last, T_predicted, flow_uv)
-        by_flow = np.isfinite(flow_uv).all(axis=1)
+        by_flow: NDArray[np.bool_] = np.isfinite(flow_uv).all(axis=1)
         tolerance = self.config.flow_tolerance_px if by_flow.any() else _ALIGNMENT_TOLERANCE_PX
         aligned, ok = align_patches(self._last_view.gray, view.gray, last.uv_px, start, tolerance)
         sigma = self.noise.sigma_uv_px
@@ -288,7 +290,7 @@ class Tracker:
         T_predicted: Array,
         flow_uv: Array,
     ) -> Array:
-        """Start (N, 2) of the alignment: flow, else ORB matches, else the matched neighbours' way."""
+        """Start (N, 2) of the alignment: flow, else ORB matches, else as matched neighbours go."""
         start = flow_uv.copy()
         missing = np.flatnonzero(~np.isfinite(flow_uv).all(axis=1))
         if len(missing) == 0:

@@ -97,8 +97,8 @@ def test_small_images_and_no_points(shape):
 
 
 def test_writer_writes_every_nth(tmp_path):
-    writer = FrameWriter(tmp_path / "frames", every=2, suffix=".png")
-    writer.start(None, 50, None)
+    writer = FrameWriter(every=2)
+    writer.start(None, 50, None, tmp_path)
     for k in range(50):
         writer.frame(make_frame(k), make_result(k))
     writer.finish()
@@ -109,8 +109,8 @@ def test_writer_writes_every_nth(tmp_path):
 
 
 def test_a_disk_that_refuses_ends_the_pictures_not_the_run(tmp_path, caplog):
-    writer = FrameWriter(tmp_path / "frames")
-    writer.start(None, 5, None)
+    writer = FrameWriter()
+    writer.start(None, 5, None, tmp_path)
     (tmp_path / "frames").rmdir()
     for k in range(200):
         writer.frame(make_frame(k), make_result(k))
@@ -119,7 +119,7 @@ def test_a_disk_that_refuses_ends_the_pictures_not_the_run(tmp_path, caplog):
 
 
 def test_finish_without_start(tmp_path):
-    FrameWriter(tmp_path / "frames").finish()
+    FrameWriter().finish()
     assert not (tmp_path / "frames").exists()
 
 

@@ -1,0 +1,185 @@
+"""The run loop: frames of a sequence through the system, into a result folder and to the sinks.
+
+Owns the order of reading, processing and writing, and what happens when a frame cannot be read or
+a person interrupts. Ground truth is opened here only after the last frame is done.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from pipelines.config import Config, config_to_dict
+from pipelines.datasets.sequence import Sequence
+from pipelines.dyob_slam import DyObSlam
+from pipelines.errors import DatasetError, FrameError
+from pipelines.evaluation import evaluate_result
+from pipelines.io.result import (
+    Result,
+    ResultWriter,
+    create_result_folder,
+    load_result,
+    run_metrics,
+)
+from pipelines.types import Frame, FrameResult
+
+RESULTS = "results"  # folder that result folders go to, below the working folder
+_log = logging.getLogger("dyob.run")
+
+
+class Sink(Protocol):
+    """Something that watches a run: a progress bar, a viewer, a writer of annotated frames."""
+
+    def start(self, sequence: Sequence, n_frames: int, config: Config, folder: Path) -> None: ...
+
+    def frame(self, frame: Frame, result: FrameResult) -> None: ...
+
+    def finish(self) -> None: ...
+
+
+@dataclass(slots=True)
+class _Progress:
+    """What a run has done so far."""
+
+    results: list[FrameResult] = field(default_factory=list)
+    skipped: int = 0
+    interrupted: bool = False
+
+
+def run(
+    sequence: Sequence,
+    config: Config | None = None,
+    output: Path | str | None = None,
+    *,
+    start: int = 0,
+    frames: int | None = None,
+    stride: int = 1,
+    sinks: Iterable[Sink] = (),
+) -> Result:
+    """Run the whole system on a sequence and return its result folder, read back.
+
+    output: the folder to write; by default a new one under `results`, with a `latest` link.
+    start, frames, stride: which frames to take, all by default. A frame that cannot be read is
+    skipped with a warning. Ctrl-C ends the run early with a valid, partial result. Raises
+    DatasetError where no frame is asked for or none can be read.
+    """
+    config = config or Config()
+    indices = _chosen_frames(len(sequence), start, frames, stride)
+    folder = create_result_folder(RESULTS, sequence.name) if output is None else Path(output)
+    writer = ResultWriter(folder)
+    writer.write_config(config_to_dict(config))
+    slam = DyObSlam(sequence.camera, config)
+    progress = _Progress()
+    sinks = tuple(sinks)
+    with writer.log_to_file():
+        _log.info("%s (%s), %d frames", sequence.name, sequence.dataset, len(indices))
+        for sink in sinks:
+            sink.start(sequence, len(indices), config, folder)
+        try:
+            _process_all(sequence, slam, indices, stride, sinks, progress)
+        except KeyboardInterrupt:
+            progress.interrupted = True
+            _log.warning(
+                "interrupted after %d frames: the result holds these", len(progress.results)
+            )
+        finally:
+            for sink in sinks:
+                sink.finish()
+        if not progress.results and not progress.interrupted:
+            raise DatasetError(
+                f"{sequence.name}: expected frames that can be read, found none among "
+                f"{len(indices)}; see {folder / 'run.log'} for each one's reason"
+            )
+        _write(writer, sequence, slam, progress)
+    evaluate_result(folder)
+    return load_result(folder)
+
+
+def _chosen_frames(n_frames: int, start: int, frames: int | None, stride: int) -> range:
+    end = n_frames if frames is None else min(n_frames, start + frames * stride)
+    indices = range(start, end, max(stride, 1))
+    if start < 0 or stride < 1 or len(indices) == 0:
+        raise DatasetError(
+            f"expected frames within 0 to {n_frames - 1}, found start {start}, stride {stride}, "
+            f"frames {frames}; choose fewer or an earlier start"
+        )
+    return indices
+
+
+def _process_all(
+    sequence: Sequence,
+    slam: DyObSlam,
+    indices: range,
+    stride: int,
+    sinks: tuple[Sink, ...],
+    progress: _Progress,
+) -> None:
+    previous: int | None = None
+    for index, pending in _read_ahead(sequence, indices):
+        try:
+            frame = pending.result()
+            _check_size(sequence, frame)
+        except FrameError as error:
+            progress.skipped += 1
+            _log.warning("frame %d skipped: %s", index, error)
+            continue
+        if stride != 1 or previous != index - 1:  # the flow starts at a frame that was not seen
+            frame = dataclasses.replace(frame, flow_prev_to_curr_px=None)
+        previous = index
+        result = slam.process(frame)
+        progress.results.append(result)
+        _log.info(
+            "frame %d %s by %s, %d inliers of %d%s, %.1f ms",
+            index,
+            result.status,
+            result.hypothesis,
+            int(result.inliers.sum()),
+            len(result.inliers),
+            ", keyframe" if result.is_keyframe else "",
+            result.timings_ms["total"],
+        )
+        for sink in sinks:
+            sink.frame(frame, result)
+
+
+def _read_ahead(sequence: Sequence, indices: range) -> Iterator[tuple[int, Future[Frame]]]:
+    """Frames in order, the next one being read while the present one is processed."""
+    with ThreadPoolExecutor(1, thread_name_prefix="reader") as reader:
+        pending = reader.submit(sequence.read, indices[0])
+        for position, index in enumerate(indices):
+            current = pending
+            if position + 1 < len(indices):
+                pending = reader.submit(sequence.read, indices[position + 1])
+            yield index, current
+
+
+def _check_size(sequence: Sequence, frame: Frame) -> None:
+    camera = sequence.camera
+    height, width = frame.image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise FrameError(
+            f"expected an image of {camera.width} x {camera.height}, found {width} x {height}; "
+            "all images of a sequence must have the calibrated size"
+        )
+
+
+def _write(writer: ResultWriter, sequence: Sequence, slam: DyObSlam, progress: _Progress) -> None:
+    """All files but the metrics' errors, which the evaluator adds from the folder."""
+    static_map = slam.static_map()
+    writer.write_run(progress.results, static_map, sequence.ground_truth())
+    metrics = {
+        "run": run_metrics(
+            progress.results,
+            static_map,
+            sequence=sequence.name,
+            dataset=sequence.dataset,
+            skipped=progress.skipped,
+            interrupted=progress.interrupted,
+        )
+    }
+    writer.write_metrics(metrics, "")
