@@ -27,7 +27,7 @@ def align_patches(
     n = len(uv_from_px)
     if n == 0:
         return np.empty((0, 2)), np.zeros(0, bool)
-    known: NDArray[np.bool_] = np.isfinite(predicted_px).all(axis=1)
+    known = np.asarray(np.isfinite(predicted_px).all(axis=1))
     start = np.where(known[:, None], predicted_px, uv_from_px)
     placed, status, _ = cv2.calcOpticalFlowPyrLK(
         gray_from,

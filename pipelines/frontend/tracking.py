@@ -264,7 +264,7 @@ class Tracker:
         last = self._last_tracks
         flow_uv = self._flow_places(view, last)
         start = self._predicted_places(view, sparse_map, last, T_predicted, flow_uv)
-        by_flow: NDArray[np.bool_] = np.isfinite(flow_uv).all(axis=1)
+        by_flow = np.asarray(np.isfinite(flow_uv).all(axis=1))
         tolerance = self.config.flow_tolerance_px if by_flow.any() else _ALIGNMENT_TOLERANCE_PX
         aligned, ok = align_patches(self._last_view.gray, view.gray, last.uv_px, start, tolerance)
         sigma = self.noise.sigma_uv_px

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from pipelines.config import Config
 from pipelines.frontend.tracking import TrackedFrame, Tracker
 from pipelines.frontend.view import View
+from pipelines.geometry import invert_T, projection_jacobian, transform_points
 from pipelines.mapping.keyframe import Keyframe, Tracks, needs_keyframe
 from pipelines.mapping.point_filter import make_points, refine_points
 from pipelines.mapping.sparse_map import SparseMap
@@ -21,7 +22,6 @@ from pipelines.mapping.triangulation import (
     match_along_epipolar_lines,
     triangulate,
 )
-from pipelines.geometry import invert_T, projection_jacobian, transform_points
 from pipelines.types import Array, Features, StereoCamera
 
 _SIGMA_NEW_UV_PX = 0.05  # a point is by definition where it was first seen
