@@ -73,7 +73,7 @@ def _plane_flow(
     return flow
 
 
-def blur_along(image: Image, flow: Flow, share: float, taps: int = 7) -> Image:
+def blur_along(image: Image, flow: Flow, share: float) -> Image:
     """`image` smeared along the flow of one frame interval, for an exposure of `share` of it.
 
     The exposure is centred on the frame's time, so blurred edges stay centred on true ones.
@@ -81,6 +81,8 @@ def blur_along(image: Image, flow: Flow, share: float, taps: int = 7) -> Image:
     H, W = image.shape[:2]
     v, u = np.mgrid[:H, :W].astype(np.float32)
     motion = np.nan_to_num(flow)
+    longest = share * float(np.quantile(np.abs(motion), 0.995))
+    taps = int(np.clip(np.ceil(longest / 1.5), 5, 31))  # a tap every 1.5 px leaves no comb
     total = np.zeros(image.shape, np.float32)
     for moment in (np.arange(taps) + 0.5) / taps - 0.5:
         step = np.float32(moment * share)

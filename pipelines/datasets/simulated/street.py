@@ -23,7 +23,7 @@ from pipelines.datasets.simulated.buildings import (
     tree,
 )
 from pipelines.datasets.simulated.facades import FACADES
-from pipelines.datasets.simulated.meshes import Mesh, merge, pose, surface
+from pipelines.datasets.simulated.meshes import WHITE, Mesh, box, merge, pose, surface
 from pipelines.datasets.simulated.people import WARDROBE, walker_mesh
 from pipelines.datasets.simulated.textures import SURFACES
 from pipelines.datasets.simulated.vehicles import SHAPES, VEHICLE_ART, car_mesh
@@ -244,7 +244,7 @@ class _Script:
         """Walkers on both pavements, about one every 9 m, some with and some against the camera."""
         for s in np.arange(4.0, self.road.end_s - 40, 8.7):
             side = self.rng.integers(0, 2)
-            lateral = self.rng.uniform(5.3, 6.6) if side else self.rng.uniform(-13.0, -11.9)
+            lateral = self.rng.uniform(5.75, 6.7) if side else self.rng.uniform(-13.2, -12.2)
             direction = 1 if self.rng.random() < 0.5 else -1
             speed = self.rng.uniform(1.0, 1.6)
             along = s + self.rng.uniform(-2, 2) + direction * speed * self.times
@@ -278,7 +278,13 @@ def _static(road: Road, rng: np.random.Generator) -> Mesh:
             edge = kerb + 0.18 * outward
             parts.append(road.strip(s, (kerb, kerb), (0.0, _KERB_M), "concrete"))
             parts.append(road.strip(s, (kerb, edge), (_KERB_M, _KERB_M), "concrete"))
-            parts.append(road.strip(s, (edge, front), (_KERB_M, _KERB_M), "paving"))
+            behind = front + 0.9 * outward  # house fronts are chords of the bends: leave no gap
+            parts.append(road.strip(s, (edge, behind), (_KERB_M, _KERB_M), "paving"))
+    x, z, _ = road.at(np.arange(*ends), 0.0)
+    low, high = np.array([x.min() - 60, z.min()]), np.array([x.max() + 60, z.max()])
+    centre, extent = (low + high) / 2, high - low
+    yard = box((extent[0], 0.02, extent[1]), "grass", WHITE, (centre[0], 0.06, centre[1]))
+    parts.append(yard)  # under everything: whatever is seen between houses stands on something
     parts += _markings(road, junctions)
     for junction in junctions:
         parts += _side_street(road, junction, rng)
@@ -321,7 +327,7 @@ def _side_street(road: Road, junction: float, rng: np.random.Generator) -> list[
             rim = sorted((edge, edge + 2.0 * away))
             span = (inner + 0.4 * outward, outer)
             parts.append(road.strip((rim[0], rim[1]), span, (_KERB_M,) * 2, "paving", 8))
-        begin = (_FRONTS[0] - 9.5) if outward < 0 else (_FRONTS[1] + 9.5)
+        begin = (_FRONTS[0] - 8.9) if outward < 0 else (_FRONTS[1] + 8.9)
         for k in range(2):
             near = begin + outward * 11.5 * k
             # left to right as seen from the street: the frame's z points away from it
@@ -340,20 +346,18 @@ def _terrace(
 ) -> list[Mesh]:
     """Houses side by side; their corners stand on the line `front`, so the row has no gaps."""
     parts = []
-    s = road.start_s
-    while s < road.end_s - 8:
-        width = rng.uniform(8.5, 13.5)
-        gap = next((j for j in junctions if s < j + 7 and s + width > j - 7), None)
-        if gap is not None:
-            width = gap - 7 - s
-        if width > 3:
-            x, z, _ = road.at(np.array([s, s + width]), front)
-            a, b = (0, 1) if outward < 0 else (1, 0)
+    stops = [road.start_s, *(x for j in junctions for x in (j - 7.0, j + 7.0)), road.end_s - 4]
+    for first, last in zip(stops[::2], stops[1::2], strict=True):
+        widths = rng.uniform(8.5, 13.5, max(1, round((last - first) / 11)))
+        edges = first + np.append(0, widths.cumsum()) * (last - first) / widths.sum()
+        x, z, _ = road.at(edges, front)
+        for i in range(len(widths)):
+            # Left to right as seen from the road: the frame's z points away from it.
+            a, b = (i, i + 1) if outward < 0 else (i + 1, i)
             direction = np.array([x[b] - x[a], z[b] - z[a]])
             yaw = np.arctan2(-direction[1], direction[0])
             block = house(float(np.hypot(*direction)), 9.0, rng)
             parts.append(block.placed(pose(x[a], -_KERB_M + 0.03, z[a], yaw)))
-        s = gap + 7 if gap is not None else s + width
     end = road.pose(road.end_s - 6, _FRONTS[0] - 2)
     parts.append(house(26, 9, rng, True).placed(end))
     return parts

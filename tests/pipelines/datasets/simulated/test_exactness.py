@@ -115,6 +115,15 @@ def test_depth_of_the_road_is_the_plane_under_the_camera(street):
     assert point[1] == pytest.approx(1.65, abs=0.08)  # bounce, pitch and roll are this small
 
 
+def test_nothing_below_the_horizon_is_open(exact):
+    """No cracks between the pieces: the lower half has depth everywhere, a room all over."""
+    for k in range(len(exact)):
+        depth = exact.read(k).depth_m
+        first = 0 if exact.name == "room" else exact.camera.height // 2 + 6
+        assert np.isfinite(depth[first:]).all()
+        assert 0.3 < np.nanmin(depth) < 8
+
+
 def test_boxes_are_those_of_the_labels(exact):
     truth = exact.ground_truth().objects
     seen = 0
