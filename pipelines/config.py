@@ -20,6 +20,7 @@ class DepthConfig:
 
     close_baselines: float = 40.0  # a point is close when z < this many baselines (paper, ORB)
     max_depth_m: float = 0.0  # ThDepth: ignore depths beyond this, 0 = the close rule alone
+    relative_error: float = 0.02  # a point is close too when its depth is this well measured
     sgbm_num_disparities: int = 96  # px, search range of the stereo matcher, multiple of 16
     sgbm_block_size: int = 5  # px, odd
     left_right_max_px: float = 1.0  # px, left-right check of disparities
@@ -41,11 +42,35 @@ class TrackingConfig:
     """Step 4: camera pose."""
 
     seed: int = 0  # of RANSAC and every other random choice
+    search_radius_px: float = 25.0  # px, around motion-predicted places, without flow
+    flow_tolerance_px: float = 6.0  # px, alignment may move a point this far from its flow
+    map_radius_px: float = 6.0  # px, around local-map points once the pose is known
+    max_hamming: int = 64  # bits of 256, of an accepted ORB match
+    inlier_px: float = 2.0  # px, reprojection error of an inlier of a motion hypothesis
+    weak_inlier_share: float = 0.5  # below this share of inliers, dense odometry joins in
+    min_inliers: int = 20  # fewer than this after bundle adjustment is LOST
+    min_points_apart_px: float = 5.0  # px, new points keep this far from tracked ones
+    restart_after_frames: int = 5  # LOST frames with features before tracking starts anew
+    use_rgbd_odometry: bool = True  # Open3D's dense odometry as the third hypothesis
+    calibrate_disparity: bool = True  # learn a constant error of the stereo disparities
 
 
 @dataclass(frozen=True, slots=True)
 class MappingConfig:
     """Step 10: sparse map."""
+
+    keyframe_min_overlap: float = 0.7  # share of tracked points that the last keyframe saw
+    keyframe_max_interval: int = 20  # frames between keyframes at most
+    local_keyframes: int = 20  # keyframes whose points make the local map
+    near_keyframe_baselines: float = 8.0  # keyframes this near in place join the local map
+    min_shared_points: int = 15  # points in common that make keyframes covisible (ORB-SLAM)
+    min_parallax_deg: float = 1.0  # deg, of a point triangulated from two keyframes
+    max_reprojection_px: float = 2.0  # px at octave 0, of a triangulated point
+    max_epipolar_px: float = 1.5  # px at octave 0, from the epipolar line
+    triangulate_with: int = 2  # covisible keyframes that a new keyframe is matched to
+    min_found_ratio: float = 0.25  # found / visible below which a point is culled (ORB-SLAM)
+    min_observations: int = 3  # frames that must have seen a point of the saved map
+    max_relative_depth_sigma: float = 0.1  # standard deviation / distance of a saved point
 
 
 @dataclass(frozen=True, slots=True)

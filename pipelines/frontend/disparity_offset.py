@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.frontend.motion_only_ba import StereoObservations, observation_information
+from pipelines.frontend.motion_only_ba import StereoObservations, observation_covariance
 from pipelines.geometry import (
     invert_T,
     pose_jacobian,
@@ -56,11 +56,12 @@ class DisparityOffset:
         points = transform_points(invert_T(T_world_camera), observations.points_world_m)
         D = projection_jacobian(camera, points)
         J = pose_jacobian(D, points)
-        information = observation_information(camera, T_world_camera, observations)
+        information = np.linalg.inv(observation_covariance(camera, T_world_camera, observations))
         residual = observations.uvr_px - project_stereo(camera, points)
         slope = -np.einsum("nij,nj->ni", D, sensitivities @ R)  # d residual / d offset
         slope[:, 2] -= 1.0
         mono = np.isnan(residual[:, 2])
+        information[mono] = _without_disparity(information[mono])
         residual[mono, 2] = slope[mono, 2] = 0.0
         weighted = information @ J
         H = np.einsum("nij,nik->jk", J, weighted)
@@ -83,6 +84,14 @@ class DisparityOffset:
         self.offset_px += step
         self._gradient += self._information * step
         return step
+
+
+def _without_disparity(information: Array) -> Array:
+    """Information (N, 3, 3) of (u_L, v, u_R) where u_R was not measured: its marginal."""
+    out = np.zeros_like(information)
+    a, b, c = information[:, :2, :2], information[:, :2, 2], information[:, 2, 2]
+    out[:, :2, :2] = a - b[:, :, None] * b[:, None, :] / c[:, None, None]
+    return out
 
 
 def follow_camera(T_world_camera: Array, points_world_m: Array, pose_slope: Array) -> Array:

@@ -14,7 +14,6 @@ from pipelines.geometry import (
     MIN_DEPTH_M,
     exp_se3,
     invert_T,
-    pose_jacobian,
     projection_jacobian,
     transform_points,
 )
@@ -22,9 +21,10 @@ from pipelines.types import Array, StereoCamera
 
 CHI2_95_2DOF = 5.991  # chi-square, 95 %, of a pixel (u_L, v)
 CHI2_95_3DOF = 7.815  # chi-square, 95 %, of a stereo pixel (u_L, v, u_R)
-_ROUNDS = 3  # solve, reject by chi-square, solve again
+_MIN_POINTS = 6  # fewer cannot be told from an accident
+_ROBUST_ROUNDS = 2  # solve with Huber's kernel, reject by chi-square, solve again
 _MAX_ITERATIONS = 10  # Levenberg-Marquardt steps per round
-_CONVERGED_STEP = 1e-7  # rad and m
+_CONVERGED_SIGMAS = 0.01  # a step this small beside the pose's standard deviation ends a round
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,129 +81,165 @@ def estimate_camera_pose(
 ) -> PoseEstimate:
     """Camera pose that minimises the reprojection error, eq. (1), from an initial guess.
 
-    Huber's kernel on Mahalanobis distances, then chi-square rejection between rounds (95 %). The
-    weight of an observation is the inverse of its pixel noise plus its point's uncertainty seen in
-    the image, which eliminates the points exactly to first order.
+    Huber's kernel on Mahalanobis distances, then chi-square rejection (95 %), twice, and a last
+    solution of the inliers alone. The weight of an observation is the inverse of its pixel noise
+    plus its point's uncertainty seen in the image, which eliminates the points exactly to first
+    order.
     """
-    chi2_limit = np.where(np.isnan(observations.uvr_px[:, 2]), CHI2_95_2DOF, CHI2_95_3DOF)
     used = np.ones(len(observations), bool)
     T = T_world_camera
-    for round_index in range(_ROUNDS):
-        information = observation_information(camera, T, observations)
-        robust = round_index < _ROUNDS - 1
-        T = _minimise(camera, T, observations, information, chi2_limit, used, robust)
-        _, chi2 = _residuals(camera, T, observations, information)
-        used = chi2 <= chi2_limit
-        if used.sum() < 6:
+    for _ in range(_ROBUST_ROUNDS):
+        problem = _Problem(camera, T, observations)
+        T = problem.minimise(T, used, robust=True)
+        used = problem.chi2(T) <= problem.limit
+        if used.sum() < _MIN_POINTS:
             break
-    residuals, chi2 = _residuals(camera, T, observations, information)
-    _, H, _ = _normal_equations(camera, T, observations, information, chi2_limit, used, False)
-    covariance = np.linalg.pinv(H, hermitian=True) if used.sum() >= 6 else np.full((6, 6), np.nan)
+    T = problem.minimise(T, used, robust=False)
+    residuals, chi2 = problem.residuals(T), problem.chi2(T)
+    used = chi2 <= problem.limit
+    covariance = np.full((6, 6), np.nan)
+    if used.sum() >= _MIN_POINTS:
+        covariance = np.linalg.pinv(problem.normal_equations(T, used, False)[0], hermitian=True)
     residuals[np.isnan(observations.uvr_px)] = np.nan
     return PoseEstimate(T, covariance, used, chi2, residuals)
 
 
-def observation_information(
+def observation_covariance(
     camera: StereoCamera, T_world_camera: Array, observations: StereoObservations
 ) -> Array:
-    """Inverse covariances (N, 3, 3) of the residuals of eq. (1), in (u_L, v, u_R).
+    """Covariances (N, 3, 3) of the residuals of eq. (1), in (u_L, v, u_R), square px.
 
     Pixel noise plus the point's covariance seen through the projection. The disparity is measured
-    on its own, so u_R = u_L - d shares the noise of u_L. Rows of unknown u_R are zero.
+    on its own, so u_R = u_L - d shares the noise of u_L.
     """
     points = transform_points(invert_T(T_world_camera), observations.points_world_m)
     J = projection_jacobian(camera, points) @ T_world_camera[:3, :3].T
     S = J @ observations.point_covariances_m2 @ J.transpose(0, 2, 1)
     variance = observations.sigma_uv_px**2
-    S[:, 0, 0] += variance
-    S[:, 1, 1] += variance
-    S[:, 0, 2] += variance
-    S[:, 2, 0] += variance
-    S[:, 2, 2] += variance + observations.sigma_disparity_px**2
-    mono = np.isnan(observations.uvr_px[:, 2])
-    S[mono, 2, :] = 0.0
-    S[mono, :, 2] = 0.0
-    S[mono, 2, 2] = 1.0
-    information = np.linalg.inv(S)
-    information[mono, 2, 2] = 0.0
-    return information
+    for row, column in ((0, 0), (1, 1), (0, 2), (2, 0), (2, 2)):
+        S[:, row, column] += variance
+    S[:, 2, 2] += observations.sigma_disparity_px**2
+    return S
 
 
-def _predict(
-    camera: StereoCamera, T: Array, observations: StereoObservations
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Points in the camera (N, 3), residuals (N, 3) with 0 where unmeasured, and visibility."""
-    points = transform_points(invert_T(T), observations.points_world_m)
-    visible = points[:, 2] > MIN_DEPTH_M
-    z = np.where(visible, points[:, 2], 1.0)
-    u = camera.fx * points[:, 0] / z + camera.cx
-    v = camera.fy * points[:, 1] / z + camera.cy
-    predicted = np.stack([u, v, u - camera.bf / z], -1)
-    residuals = np.nan_to_num(observations.uvr_px - predicted, nan=0.0)  # eq. (1)
-    return points, residuals, visible
+def whitening(covariances: Array) -> Array:
+    """Lower triangular W (N, 3, 3) with W S W^T = I, by Cholesky in closed form."""
+    S = covariances
+    W = np.zeros_like(S)
+    g00 = np.sqrt(S[:, 0, 0])
+    g10, g20 = S[:, 1, 0] / g00, S[:, 2, 0] / g00
+    g11 = np.sqrt(S[:, 1, 1] - g10**2)
+    g21 = (S[:, 2, 1] - g20 * g10) / g11
+    g22 = np.sqrt(S[:, 2, 2] - g20**2 - g21**2)
+    W[:, 0, 0], W[:, 1, 1], W[:, 2, 2] = 1.0 / g00, 1.0 / g11, 1.0 / g22
+    W[:, 1, 0] = -g10 * W[:, 0, 0] * W[:, 1, 1]
+    W[:, 2, 1] = -g21 * W[:, 1, 1] * W[:, 2, 2]
+    W[:, 2, 0] = -(g20 * W[:, 0, 0] + g21 * W[:, 1, 0]) * W[:, 2, 2]
+    return W
 
 
-def _residuals(
-    camera: StereoCamera, T: Array, observations: StereoObservations, information: Array
-) -> tuple[Array, Array]:
-    _, residuals, visible = _predict(camera, T, observations)
-    chi2 = np.einsum("ni,nij,nj->n", residuals, information, residuals)
-    return residuals, np.where(visible, chi2, np.inf)
+class _Problem:
+    """The least-squares problem of one pose, whitened at a given guess.
 
+    Arrays are kept by component (3, N) rather than by point: long contiguous rows are what makes
+    numpy fast here.
+    """
 
-def _robust_cost(chi2: Array, limit: Array, used: NDArray[np.bool_], robust: bool) -> float:
-    """Half the Huber cost over the used observations; one behind the camera costs a large sum."""
-    chi2 = np.where(np.isfinite(chi2), chi2, 1e3 * limit)
-    if robust:
-        chi2 = np.where(chi2 <= limit, chi2, 2.0 * np.sqrt(limit * chi2) - limit)
-    return 0.5 * float(chi2[used].sum())
+    def __init__(self, camera: StereoCamera, T: Array, observations: StereoObservations) -> None:
+        self.camera = camera
+        self.points = observations.points_world_m
+        self.mono = np.isnan(observations.uvr_px[:, 2])
+        self.uvr = np.nan_to_num(observations.uvr_px).T.copy()
+        self.limit = np.where(self.mono, CHI2_95_2DOF, CHI2_95_3DOF)
+        W = whitening(observation_covariance(camera, T, observations))
+        W[self.mono, 2] = 0.0  # the first two rows do not know of the third
+        self.W = W.transpose(1, 2, 0).copy()
 
+    def _in_camera(self, T: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+        """x, y, 1 / z of the points in the camera, each (N,), and which are in front of it."""
+        x, y, z = T[:3, :3].T @ (self.points.T - T[:3, 3:])
+        visible = z > MIN_DEPTH_M
+        return x, y, 1.0 / np.where(visible, z, 1.0), visible
 
-def _normal_equations(
-    camera: StereoCamera,
-    T: Array,
-    observations: StereoObservations,
-    information: Array,
-    limit: Array,
-    used: NDArray[np.bool_],
-    robust: bool,
-) -> tuple[float, Array, Array]:
-    """Cost, J^T W J (6, 6) and J^T W r (6,) at `T`, for the right perturbation [omega, v]."""
-    points, residuals, visible = _predict(camera, T, observations)
-    J = pose_jacobian(projection_jacobian(camera, points), points)
-    chi2 = np.einsum("ni,nij,nj->n", residuals, information, residuals)
-    cost = _robust_cost(np.where(visible, chi2, np.inf), limit, used, robust)
-    weight = (used & visible).astype(float)
-    if robust:
-        weight *= np.minimum(1.0, np.sqrt(limit / np.maximum(chi2, 1e-12)))
-    WJ = (information * weight[:, None, None]) @ J
-    flat = J.reshape(-1, 6)
-    WJ_flat = WJ.reshape(-1, 6)
-    return cost, flat.T @ WJ_flat, WJ_flat.T @ residuals.ravel()
+    def _residual_rows(self, x: Array, y: Array, inverse_z: Array) -> tuple[Array, Array, Array]:
+        """Measured minus predicted u_L, v, u_R, each (N,); eq. (1)."""
+        camera = self.camera
+        u = camera.fx * x * inverse_z + camera.cx
+        v = camera.fy * y * inverse_z + camera.cy
+        u_right = u - camera.bf * inverse_z
+        return self.uvr[0] - u, self.uvr[1] - v, np.where(self.mono, 0.0, self.uvr[2] - u_right)
 
+    def _whiten(self, a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
+        W = self.W
+        return W[0, 0] * a, W[1, 0] * a + W[1, 1] * b, W[2, 0] * a + W[2, 1] * b + W[2, 2] * c
 
-def _minimise(
-    camera: StereoCamera,
-    T: Array,
-    observations: StereoObservations,
-    information: Array,
-    limit: Array,
-    used: NDArray[np.bool_],
-    robust: bool,
-) -> Array:
-    """Levenberg-Marquardt from `T` with fixed weights and a fixed set of observations."""
-    damping = 1e-6
-    cost, H, g = _normal_equations(camera, T, observations, information, limit, used, robust)
-    for _ in range(_MAX_ITERATIONS):
-        step = np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-9), g)
-        T_new = T @ exp_se3(step)
-        trial = _normal_equations(camera, T_new, observations, information, limit, used, robust)
-        if trial[0] <= cost:
-            T, (cost, H, g), damping = T_new, trial, max(damping * 0.1, 1e-9)
-            if np.abs(step).max() < _CONVERGED_STEP:
+    def residuals(self, T: Array) -> Array:
+        """(N, 3) residuals in px, 0 where unmeasured."""
+        return np.stack(self._residual_rows(*self._in_camera(T)[:3]), -1)
+
+    def chi2(self, T: Array) -> Array:
+        """(N,) squared Mahalanobis distances, inf behind the camera."""
+        x, y, inverse_z, visible = self._in_camera(T)
+        e0, e1, e2 = self._whiten(*self._residual_rows(x, y, inverse_z))
+        return np.where(visible, e0 * e0 + e1 * e1 + e2 * e2, np.inf)
+
+    def cost(self, T: Array, used: NDArray[np.bool_], robust: bool) -> float:
+        """Half the (Huber) cost of the used observations; one behind the camera costs a lot."""
+        chi2, limit = self.chi2(T)[used], self.limit[used]
+        chi2 = np.minimum(chi2, 1e6 * limit)
+        if robust:
+            chi2 = np.where(chi2 <= limit, chi2, 2.0 * np.sqrt(limit * chi2) - limit)
+        return 0.5 * float(chi2.sum())
+
+    def normal_equations(
+        self, T: Array, used: NDArray[np.bool_], robust: bool
+    ) -> tuple[Array, Array]:
+        """J^T W J (6, 6) and J^T W r (6,) at `T`, for the right perturbation [omega, v]."""
+        camera = self.camera
+        x, y, inverse_z, visible = self._in_camera(T)
+        z = 1.0 / inverse_z
+        e = self._whiten(*self._residual_rows(x, y, inverse_z))
+        weight = (used & visible).astype(float)
+        if robust:
+            chi2 = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
+            weight *= np.minimum(1.0, np.sqrt(self.limit / np.maximum(chi2, 1e-12)))
+        # d(u_L, v, u_R) / d(point in the camera), whitened, column by column
+        fx, fy = camera.fx * inverse_z, camera.fy * inverse_z
+        du_dz = -fx * x * inverse_z
+        zero = np.zeros_like(x)
+        along_x = self._whiten(fx, zero, fx)
+        along_y = self._whiten(zero, fy, zero)
+        along_z = self._whiten(
+            du_dz, -fy * y * inverse_z, du_dz + camera.bf * inverse_z * inverse_z
+        )
+        J = np.empty((6, 3, len(x)))
+        for row in range(3):
+            ax, ay, az = along_x[row], along_y[row], along_z[row]
+            J[0, row] = ay * z - az * y  # the point moves by [q]x omega - v
+            J[1, row] = az * x - ax * z
+            J[2, row] = ax * y - ay * x
+            J[3, row], J[4, row], J[5, row] = -ax, -ay, -az
+        weighted = (J * weight).reshape(6, -1)
+        return weighted @ J.reshape(6, -1).T, weighted @ np.concatenate(e)
+
+    def minimise(self, T: Array, used: NDArray[np.bool_], robust: bool) -> Array:
+        """Levenberg-Marquardt from `T` with a fixed set of observations."""
+        damping = 1e-6
+        cost = self.cost(T, used, robust)
+        H, g = self.normal_equations(T, used, robust)
+        for _ in range(_MAX_ITERATIONS):
+            step = np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-9), g)
+            if not np.isfinite(step).all():
                 break
-        else:
-            damping *= 100.0
-            if damping > 1e6:
-                break
-    return T
+            T_new = T @ exp_se3(step)
+            cost_new = self.cost(T_new, used, robust)
+            if cost_new <= cost:
+                T, cost, damping = T_new, cost_new, max(damping * 0.1, 1e-9)
+                if step @ H @ step < _CONVERGED_SIGMAS**2:
+                    break
+                H, g = self.normal_equations(T, used, robust)
+            else:
+                damping *= 100.0
+                if damping > 1e6:
+                    break
+        return T
