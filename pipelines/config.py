@@ -30,10 +30,10 @@ class DepthConfig:
 class OrbConfig:
     """Step 3: ORB features on static pixels."""
 
-    n_features: int = 2000  # per image, after even spreading
+    n_features: int = 1500  # per image, after even spreading
     n_levels: int = 8  # pyramid levels (paper)
     scale_factor: float = 1.2  # between levels (paper, as ORB-SLAM)
-    fast_threshold: int = 12  # grey levels, FAST corner threshold
+    fast_threshold: int = 24  # grey levels, FAST corner threshold after contrast is evened
     mask_dilation_px: int = 7  # px, movable masks grow by this before features are kept off them
 
 
@@ -44,7 +44,7 @@ class TrackingConfig:
     seed: int = 0  # of RANSAC and every other random choice
     search_radius_px: float = 25.0  # px, around motion-predicted places, without flow
     flow_tolerance_px: float = 6.0  # px, alignment may move a point this far from its flow
-    map_radius_px: float = 6.0  # px, around local-map points once the pose is known
+    map_radius_px: float = 10.0  # px, around local-map points once the pose is known
     max_hamming: int = 64  # bits of 256, of an accepted ORB match
     inlier_px: float = 2.0  # px, reprojection error of an inlier of a motion hypothesis
     weak_inlier_share: float = 0.5  # below this share of inliers, dense odometry joins in
@@ -62,7 +62,7 @@ class MappingConfig:
     keyframe_min_overlap: float = 0.7  # share of tracked points that the last keyframe saw
     keyframe_max_interval: int = 20  # frames between keyframes at most
     local_keyframes: int = 20  # keyframes whose points make the local map
-    near_keyframe_baselines: float = 8.0  # keyframes this near in place join the local map
+    near_keyframe_baselines: float = 15.0  # keyframes this near in place join the local map
     min_shared_points: int = 15  # points in common that make keyframes covisible (ORB-SLAM)
     min_parallax_deg: float = 1.0  # deg, of a point triangulated from two keyframes
     max_reprojection_px: float = 2.0  # px at octave 0, of a triangulated point
