@@ -22,7 +22,7 @@ class DepthConfig:
     max_depth_m: float = 0.0  # ThDepth: ignore depths beyond this, 0 = the close rule alone
     relative_error: float = 0.02  # a point is close too when its depth is this well measured
     sgbm_num_disparities: int = 96  # px, search range of the stereo matcher, multiple of 16
-    sgbm_block_size: int = 5  # px, odd
+    sgbm_block_size: int = 3  # px, odd
     left_right_max_px: float = 1.0  # px, left-right check of disparities
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipelines.config import Config
 from pipelines.depth import StereoDepth
 from pipelines.frontend.orb import OrbExtractor
+from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame, Tracker
 from pipelines.frontend.view import View, make_view
 from pipelines.mapping.keyframe import Tracks
@@ -45,8 +46,9 @@ class DyObSlam:
         self.map = SparseMap(camera, self.config.mapping)
         self._orb = OrbExtractor(self.config.orb)
         self._stereo: StereoDepth | None = None
-        self._tracker = Tracker(camera, self.config.tracking, self.config.depth)
-        self._mapping = LocalMapping(camera, self.config)
+        self.sensor = Sensor(camera, self.config.depth)
+        self._tracker = Tracker(self.sensor, self.config.tracking)
+        self._mapping = LocalMapping(self.sensor, self.config)
         self._lost_frames = 0
         self._timings_ms: dict[str, float] = {}
 
@@ -81,8 +83,7 @@ class DyObSlam:
         return self._stereo.compute(frame.image, frame.image_right)
 
     def _see(self, frame: Frame, depth_m: NDArray[np.float32] | None) -> View:
-        sigma = self._tracker.noise.sigma_disparity_px
-        offset = self._tracker.offset.offset_px
+        sigma, offset = self.sensor.noise.sigma_disparity_px, self.sensor.offset.offset_px
         return make_view(self.camera, frame, depth_m, self._orb, sigma, offset)
 
     def _track(self, view: View) -> TrackedFrame:
@@ -96,7 +97,7 @@ class DyObSlam:
             self._lost_frames = 0
             return tracked
         self._tracker.forget_flow()
-        if len(self._mapping.mappable_features(self._tracker, view, Tracks.empty())):
+        if len(self._mapping.mappable_features(view, Tracks.empty())):
             self._lost_frames += 1
         if self._lost_frames >= self.config.tracking.restart_after_frames:
             return self._start(view, tracked.T_world_camera)
@@ -104,7 +105,7 @@ class DyObSlam:
 
     def _start(self, view: View, T_world_camera: Array) -> TrackedFrame:
         """First frame, or a new start at the predicted pose after a lost stretch."""
-        n_points = len(self._mapping.mappable_features(self._tracker, view, Tracks.empty()))
+        n_points = len(self._mapping.mappable_features(view, Tracks.empty()))
         enough = n_points >= self.config.tracking.min_inliers
         if enough:
             self._tracker.start(view, T_world_camera)
@@ -123,7 +124,7 @@ class DyObSlam:
     def _grow_map(self, view: View, tracked: TrackedFrame) -> bool:
         if tracked.status is not TrackingStatus.OK:
             return False
-        tracks, is_keyframe = self._mapping.integrate(self.map, self._tracker, view, tracked)
+        tracks, is_keyframe = self._mapping.integrate(self.map, view, tracked)
         self._tracker.remember(view, tracks)
         return is_keyframe
 

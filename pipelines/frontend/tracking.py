@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipelines.config import DepthConfig, TrackingConfig
+from pipelines.config import TrackingConfig
 from pipelines.frontend.alignment import align_patches, fuse_measurements
-from pipelines.frontend.disparity_offset import DisparityOffset
 from pipelines.frontend.hypotheses import (
     ConstantVelocity,
     choose_hypothesis,
@@ -25,18 +24,17 @@ from pipelines.frontend.hypotheses import (
 )
 from pipelines.frontend.matching import match_all, match_in_radius
 from pipelines.frontend.motion_only_ba import PoseEstimate, estimate_camera_pose
-from pipelines.frontend.noise import NoiseModel
 from pipelines.frontend.rgbd_odometry import estimate_rgbd_odometry
-from pipelines.frontend.sampling import sample_bilinear, sample_disparity
+from pipelines.frontend.sampling import sample_bilinear
+from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
 from pipelines.geometry import invert_T, project_stereo, transform_points
 from pipelines.mapping.keyframe import Tracks
 from pipelines.mapping.sparse_map import SparseMap
-from pipelines.types import Array, MotionHypothesis, StereoCamera, TrackingStatus
+from pipelines.types import Array, MotionHypothesis, TrackingStatus
 
 _ALIGNMENT_TOLERANCE_PX = 10.0  # alignment may move a point this far from an ORB match
 _RELOCALISE_AGAINST = 5  # latest keyframes tried when lost
-_DEPTH_SENSOR_SIGMA = 0.002  # 1 / m, sigma_z = this * z^2 of structured light, to begin with
 _NEIGHBOURS = 5  # matched points that predict the place of an unmatched one
 
 Stage = Callable[[str], AbstractContextManager[None]]
@@ -72,38 +70,13 @@ class _Measurement:
 class Tracker:
     """Tracks a camera against a sparse map; step 4 of the design."""
 
-    def __init__(self, camera: StereoCamera, config: TrackingConfig, depth: DepthConfig) -> None:
-        self.camera, self.config, self.depth = camera, config, depth
-        self.noise = NoiseModel()
-        if camera.is_rgbd:
-            self.noise.sigma_disparity_px = _DEPTH_SENSOR_SIGMA * camera.bf
-        self.offset = DisparityOffset()
+    def __init__(self, sensor: Sensor, config: TrackingConfig) -> None:
+        self.sensor, self.config = sensor, config
+        self.camera, self.noise = sensor.camera, sensor.noise
         self.motion: ConstantVelocity | None = None
         self._last_view: View | None = None
         self._last_tracks = Tracks.empty()
         self._last_is_previous = False
-
-    # ----------------------------------------------------------------- depth
-
-    @property
-    def min_close_disparity_px(self) -> float:
-        """Disparity above which a point counts as close.
-
-        The paper's rule is z < 40 baselines. Deviation: depths whose relative error is measured to
-        be below `relative_error` are close as well, and for a depth sensor that alone counts, as
-        its baseline is a convention.
-        """
-        by_baseline = self.camera.fx / self.depth.close_baselines
-        by_precision = self.noise.sigma_disparity_px / self.depth.relative_error
-        limit = by_precision if self.camera.is_rgbd else min(by_baseline, by_precision)
-        if self.depth.max_depth_m > 0:
-            limit = max(limit, self.camera.bf / self.depth.max_depth_m)
-        return limit
-
-    def measure_disparity(self, view: View, uv_px: Array) -> Array:
-        """Disparities (N,) of close pixels (N, 2); NaN where far or unknown."""
-        disparity = sample_disparity(view.disparity_px, uv_px, self.noise.sigma_disparity_px)
-        return np.where(disparity >= self.min_close_disparity_px, disparity, np.nan)
 
     # ----------------------------------------------------------------- state
 
@@ -226,7 +199,7 @@ class Tracker:
             (last.gray, last.depth_of_static_m(self.camera)),
             (view.gray, view.depth_of_static_m(self.camera)),
             invert_T(self.motion.T_world_camera) @ T_predicted,
-            self.camera.bf / self.min_close_disparity_px,
+            self.camera.bf / self.sensor.min_close_disparity_px,
         )
         return name, None if T_prev_curr is None else self.motion.T_world_camera @ T_prev_curr
 
@@ -274,7 +247,7 @@ class Tracker:
         aligned[~ok] = np.nan
         valid &= view.is_static(uv) & np.isfinite(uv).all(axis=1)
         uv, ids = uv[valid], last.point_ids[valid]
-        tracks = Tracks(ids, uv, self.measure_disparity(view, uv), sigma_px[valid])
+        tracks = Tracks(ids, uv, self.sensor.read_close_disparity(view, uv), sigma_px[valid])
         return _Measurement(tracks, {"flow": flow_uv[valid], "alignment": aligned[valid]})
 
     def _flow_places(self, view: View, last: Tracks) -> Array:
@@ -344,7 +317,7 @@ class Tracker:
         )
         uv = features.uv_px[free[chosen]]
         sigma = np.full(len(uv), self.noise.sigma_uv_px["orb"])
-        return Tracks(ids[matched], uv, self.measure_disparity(view, uv), sigma), ids
+        return Tracks(ids[matched], uv, self.sensor.read_close_disparity(view, uv), sigma), ids
 
     # ----------------------------------------------------------------- noise
 

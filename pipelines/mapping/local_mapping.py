@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipelines.config import Config
-from pipelines.frontend.tracking import TrackedFrame, Tracker
+from pipelines.frontend.sensor import Sensor
+from pipelines.frontend.tracking import TrackedFrame
 from pipelines.frontend.view import View
 from pipelines.geometry import invert_T, projection_jacobian, transform_points
 from pipelines.mapping.keyframe import Keyframe, Tracks, needs_keyframe
@@ -26,19 +27,18 @@ from pipelines.types import Array, Features, StereoCamera
 
 _SIGMA_NEW_UV_PX = 0.05  # a point is by definition where it was first seen
 _FAR_RELATIVE_SIGMA = 0.5  # a far point's disparity is only a first guess, to be triangulated
-_MIN_FAR_DISPARITY_PX = 1.5  # below this a disparity does not even say that much
-_MIN_FAR_SIGMAS = 3.0  # nor when it is within this many standard deviations of zero
 _TRIANGULATED_SIGMA_PX = 1.0  # px, of both pixels of a triangulated point
 
 
 class LocalMapping:
     """Grows a `SparseMap` frame by frame."""
 
-    def __init__(self, camera: StereoCamera, config: Config) -> None:
-        self.camera, self.config = camera, config
+    def __init__(self, sensor: Sensor, config: Config) -> None:
+        self.sensor, self.config = sensor, config
+        self.camera = sensor.camera
 
     def integrate(
-        self, sparse_map: SparseMap, tracker: Tracker, view: View, tracked: TrackedFrame
+        self, sparse_map: SparseMap, view: View, tracked: TrackedFrame
     ) -> tuple[Tracks, bool]:
         """Take a tracked frame into the map.
 
@@ -48,10 +48,10 @@ class LocalMapping:
         sparse_map.record_sight(
             np.concatenate([tracked.visible_ids, tracked.tracks.point_ids]), tracks.point_ids
         )
-        self._refine(sparse_map, tracker, tracked, tracks)
-        free = self.mappable_features(tracker, view, tracks)
+        self._refine(sparse_map, tracked, tracks)
+        free = self.mappable_features(view, tracks)
         budget = max(0, self.config.orb.n_features - len(tracks))
-        new = self._add_points(sparse_map, tracker, view, tracked.T_world_camera, free[:budget])
+        new = self._add_points(sparse_map, view, tracked.T_world_camera, free[:budget])
         tracks = Tracks.concatenate(tracks, new)
         last = sparse_map.keyframes[-1] if sparse_map.keyframes else None
         is_keyframe = needs_keyframe(self.config.mapping, tracks, last, view.frame_index)
@@ -60,15 +60,12 @@ class LocalMapping:
         sparse_map.cull_points(tracks.point_ids)
         return tracks[sparse_map.alive[tracks.point_ids]], is_keyframe
 
-    def mappable_features(self, tracker: Tracker, view: View, tracks: Tracks) -> NDArray[np.int64]:
+    def mappable_features(self, view: View, tracks: Tracks) -> NDArray[np.int64]:
         """Features with some depth, away from the tracked points; the strongest first."""
         features = view.features
         if len(features) == 0:
             return np.empty(0, np.int64)
-        disparity = self.camera.bf / features.depth_m
-        sigma = tracker.noise.sigma_disparity_px
-        usable = disparity > max(_MIN_FAR_DISPARITY_PX, _MIN_FAR_SIGMAS * sigma)
-        usable |= disparity >= tracker.min_close_disparity_px
+        usable = self.camera.bf / features.depth_m >= self.sensor.min_disparity_px
         usable &= self._away_from(features.uv_px, tracks.uv_px)
         chosen = np.flatnonzero(usable)
         return chosen[np.argsort(-features.response[chosen], kind="stable")]
@@ -80,19 +77,18 @@ class LocalMapping:
         distance, _ = cKDTree(occupied_px).query(uv_px, distance_upper_bound=apart)
         return ~np.isfinite(distance)
 
-    def _refine(
-        self, sparse_map: SparseMap, tracker: Tracker, tracked: TrackedFrame, tracks: Tracks
-    ) -> None:
+    def _refine(self, sparse_map: SparseMap, tracked: TrackedFrame, tracks: Tracks) -> None:
         if len(tracks) == 0:
             return
         ids, T = tracks.point_ids, tracked.T_world_camera
-        observations = sparse_map.observe(tracks, tracker.noise.sigma_disparity_px)
+        sigma = self.sensor.noise.sigma_disparity_px
+        observations = sparse_map.observe(tracks, sigma)
         if self.config.tracking.calibrate_disparity and not self.camera.is_rgbd:
-            pose_slope = tracker.offset.learn(
+            pose_slope = self.sensor.offset.learn(
                 self.camera, T, observations, sparse_map.offset_slope[ids]
             )
-            sparse_map.shift_offset(T, pose_slope, tracker.offset.step())
-            observations = sparse_map.observe(tracks, tracker.noise.sigma_disparity_px)
+            sparse_map.shift_offset(T, pose_slope, self.sensor.offset.step())
+            observations = sparse_map.observe(tracks, sigma)
         points, covariances, slopes = refine_points(
             self.camera, T, tracked.covariance, observations, sparse_map.offset_slope[ids]
         )
@@ -103,7 +99,6 @@ class LocalMapping:
     def _add_points(
         self,
         sparse_map: SparseMap,
-        tracker: Tracker,
         view: View,
         T_world_camera: Array,
         chosen: NDArray[np.int64],
@@ -113,8 +108,8 @@ class LocalMapping:
         if len(features) == 0:
             return Tracks.empty()
         disparity = self.camera.bf / features.depth_m
-        close = disparity >= tracker.min_close_disparity_px
-        sigma = tracker.noise.sigma_disparity_px
+        close = disparity >= self.sensor.min_close_disparity_px
+        sigma = self.sensor.noise.sigma_disparity_px
         sigma_disparity = np.where(close, sigma, np.maximum(sigma, _FAR_RELATIVE_SIGMA * disparity))
         points, covariances = make_points(
             self.camera,
@@ -140,7 +135,7 @@ class LocalMapping:
         """Remember the frame; triangulate what has no point yet with its neighbours."""
         free = view.features[self._away_from(view.features.uv_px, tracks.uv_px)]
         T = tracked.T_world_camera
-        neighbours = sparse_map._candidate_keyframes(tracks.point_ids, T)[::-1]
+        neighbours = sparse_map.local_keyframes(tracks.point_ids, T)[::-1]
         for index in neighbours[: self.config.mapping.triangulate_with]:
             new, used = self._triangulate_with(
                 sparse_map, sparse_map.keyframes[index], view, T, free
@@ -156,7 +151,7 @@ class LocalMapping:
         """Points from the free features of this frame and of one keyframe."""
         config = self.config.mapping
         used = np.zeros(len(free), bool)
-        T_curr_other = np.linalg.inv(T) @ other.T_world_camera
+        T_curr_other = invert_T(T) @ other.T_world_camera
         i, j = match_along_epipolar_lines(
             self.camera, T_curr_other, free, other.free_features, config.max_epipolar_px
         )

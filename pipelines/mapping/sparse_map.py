@@ -145,7 +145,7 @@ class SparseMap:
         shared = np.zeros(index, np.int64)
         flags = np.zeros(self._size, bool)
         flags[ids] = True
-        for other in self._candidate_keyframes(ids, keyframe.T_world_camera):
+        for other in self.local_keyframes(ids, keyframe.T_world_camera):
             shared[other] = flags[self.keyframes[other].tracks.point_ids].sum()
         covisible = np.flatnonzero(shared >= self.config.min_shared_points)
         self._covisible.append(covisible[np.argsort(-shared[covisible], kind="stable")])
@@ -159,7 +159,7 @@ class SparseMap:
         """Positions in `keyframes` of those that share points with keyframe `index`."""
         return self._covisible[index]
 
-    def _candidate_keyframes(self, point_ids: Ids, T_world_camera: Array) -> Ids:
+    def local_keyframes(self, point_ids: Ids, T_world_camera: Array) -> Ids:
         """Keyframes that may see these points: their first observers, those's neighbours, and
         keyframes near in place and direction, which is where a path crosses itself."""
         if not self.keyframes:
@@ -184,7 +184,7 @@ class SparseMap:
 
     def local_points(self, T_world_camera: Array, tracked_ids: Ids) -> tuple[Ids, Array]:
         """Points of the local map in view but not tracked: ids (N,) and predicted pixels (N, 2)."""
-        keyframes = self._candidate_keyframes(tracked_ids, T_world_camera)
+        keyframes = self.local_keyframes(tracked_ids, T_world_camera)
         flags = np.zeros(self._size, bool)
         for index in keyframes:
             flags[self.keyframes[index].tracks.point_ids] = True

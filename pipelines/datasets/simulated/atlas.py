@@ -10,11 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.datasets.simulated.textures import Texture
-from pipelines.types import Array, Image
+from pipelines.types import Image
 
 _WIDTH = 4096
 _PAD = 2  # texels repeated around each level, so that bilinear look-ups wrap
+_SHIFTS = tuple(np.float32((k + 0.5) / 4 - 0.5) for k in range(4))
 _ROW = 2048  # cv2.remap takes no side above 32767: look-ups go in rows of this many
+
+
+Floats = NDArray[np.float32]
 
 
 class Atlas:
@@ -45,34 +49,51 @@ class Atlas:
                 x, y, shelf = 0, y + shelf, 0
             shelf = max(shelf, h + 2 * _PAD)
             k = i * self._deepest + j
-            self._x0[k], self._y0[k], self._w[k], self._h[k] = x + _PAD, y + _PAD, w, h
+            self._x0[k], self._y0[k], self._w[k], self._h[k] = x + _PAD - 0.5, y + _PAD - 0.5, w, h
             x += w + 2 * _PAD
         picture = np.zeros((y + shelf, _WIDTH, 4), np.uint8)
         for i, j in slots:
             level = np.pad(self._levels[i][j], ((_PAD, _PAD), (_PAD, _PAD), (0, 0)), mode="wrap")
             k = i * self._deepest + j
-            top, left = int(self._y0[k]) - _PAD, int(self._x0[k]) - _PAD
+            top, left = int(self._y0[k] + 0.5) - _PAD, int(self._x0[k] + 0.5) - _PAD
             picture[top : top + level.shape[0], left : left + level.shape[1]] = level
         return picture
 
-    def look_up(self, index: NDArray[np.int32], u: Array, v: Array, step2_px: Array) -> Image:
-        """RGBA planes (4, N) of textures `index` (N,) at (u, v) in tiles.
+    def look_up(
+        self,
+        index: NDArray[np.int32],
+        tiles: tuple[Floats, Floats],
+        step2_px: Floats,
+        along: tuple[Floats, Floats] | None = None,
+    ) -> Floats:
+        """RGBA planes (4, N) of textures `index` (N,) at `tiles` (u, v), whole numbers repeating.
 
         step2_px: (N,) squared distance in texels (of the full level) between neighbouring pixels.
+        along: step (u, v) over which four look-ups are spread and averaged.
         """
         # log2 of a square is twice log2; 0.35 leans to the sharper side of the rounding.
         level = np.float32(0.5) * np.log2(np.maximum(step2_px, 1.0)) + np.float32(0.35)
         level = np.minimum(level.astype(np.int32), self._count[index] - 1)
         slot = index * self._deepest + level
-        x = (u - np.floor(u)) * self._w[slot] + self._x0[slot] - np.float32(0.5)
-        y = (v - np.floor(v)) * self._h[slot] + self._y0[slot] - np.float32(0.5)
-        N = len(x)
-        rows = -(-N // _ROW)
-        padded = np.zeros((2, rows * _ROW), np.float32)
-        padded[0, :N], padded[1, :N] = x, y
-        map_x, map_y = padded.reshape(2, rows, _ROW)
-        found = cv2.remap(self._picture, map_x, map_y, cv2.INTER_LINEAR)
-        return np.stack(cv2.split(found)).reshape(4, -1)[:, :N]
+        frames = [(self._w[slot], self._x0[slot]), (self._h[slot], self._y0[slot])]
+        N = len(slot)
+        maps = np.zeros((2, -(-N // _ROW) * _ROW), np.float32)
+        total: NDArray[np.uint16] | Image | None = None
+        for shift in _SHIFTS if along is not None else (0.0,):
+            for axis, (length, start) in enumerate(frames):
+                place = tiles[axis] if along is None else tiles[axis] + shift * along[axis]
+                place = place - np.floor(place)
+                place *= length
+                np.add(place, start, out=maps[axis, :N])
+            found = cv2.remap(
+                self._picture,
+                maps[0].reshape(-1, _ROW),
+                maps[1].reshape(-1, _ROW),
+                cv2.INTER_LINEAR,
+            )
+            total = found if total is None else cv2.add(total, found, dtype=cv2.CV_16U)
+        planes = np.stack(cv2.split(total)).reshape(4, -1)[:, :N].astype(np.float32)
+        return planes if along is None else planes * np.float32(1 / len(_SHIFTS))
 
 
 def _reductions(rgba: Image) -> list[Image]:

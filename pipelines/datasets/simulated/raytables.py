@@ -93,7 +93,8 @@ class ViewTable:
         tiles0 = table.corner_tiles + offset
         # The whole part changes nothing in a tiled texture, and costs float32 its precision.
         tiles0 -= np.floor(tiles0)
-        G = np.einsum("kj,mij->kim", rays, table.gradient_tiles)
+        M = len(table.normal)
+        G = (rays @ table.gradient_tiles.reshape(-1, 3).T).reshape(3, M, 2).swapaxes(1, 2)
         nd = rays @ table.normal.T
         shading = table.corner_normals.sum(1)
         side = np.sign((from_corner * table.normal).sum(1)) * np.sign(

@@ -22,7 +22,7 @@ from pipelines.datasets.simulated.world import World
 from pipelines.geometry import invert_T, make_T
 from pipelines.types import Array, Image
 
-_EDGE_CONTRAST = 20  # grey levels between neighbours of different geometry that earn more rays
+_EDGE_CONTRAST = 24  # grey levels between neighbours of different geometry that earn more rays
 _SUB_PIXELS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
 
 

@@ -5,6 +5,9 @@ Owns the look of a simulated world. Everything is arrays of pixels, one plane a 
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,8 +19,8 @@ from pipelines.datasets.simulated.world import Actor, World
 from pipelines.geometry import make_T
 from pipelines.types import Array
 
-_CHUNK = 1 << 15
-_TAPS = 4  # look-ups along the long side of a pixel's footprint
+_CHUNK = 1 << 16  # samples that one thread shades at a time
+_TAPS = 4  # look-ups of the atlas along the long side of a pixel's footprint
 _HAZE_RGB = (204.0, 214.0, 222.0)
 _PATCH_REACH_M = 60.0  # shadow patches farther away than this are too small to see
 
@@ -30,6 +33,7 @@ class Shading:
         self._world, self._atlas, self._sky_index, self._bodies = world, atlas, sky_index, bodies
         self._shadow = ShadowMap(world.static, world.light)
         towards = np.asarray(world.light.towards)
+        self._threads = ThreadPoolExecutor(min(os.cpu_count() or 1, 4), "shading")
         self._towards = (towards / np.linalg.norm(towards)).astype(np.float32)
 
     def colours(
@@ -43,16 +47,25 @@ class Shading:
         lamp = self._shadow.lit(points)
         around = np.ones_like(lamp)
         self._darken(samples, still, points, (lamp, around), T_scene_camera, index)
-        for start in range(0, len(still), _CHUNK):  # what fits the processor's cache is faster
+        flat = self._flat_facing(world)
+
+        def shade_still(start: int) -> None:
             part = slice(start, start + _CHUNK)
-            lit = self._lit(world, samples, still[part], lamp[part], around[part])
-            colour[:, still[part]] = lit
-        for item in placed[1:]:
+            lights = lamp[part], around[part]
+            colour[:, still[part]] = self._lit(world, samples, still[part], lights, flat)
+
+        def shade_actor(item: PlacedBody) -> None:
             mine = samples.of(item.owner, item.window)
             if len(mine):
                 at = world.points(samples.u[mine], samples.v[mine], samples.t[mine])
-                lamp = self._shadow.lit(at)
-                colour[:, mine] = self._lit(item, samples, mine, lamp, np.ones_like(lamp))
+                share = self._shadow.lit(at)
+                colour[:, mine] = self._lit(item, samples, mine, (share, np.ones_like(share)))
+
+        # Every sample belongs to one of these, so the threads write apart from each other.
+        jobs = [self._threads.submit(shade_still, i) for i in range(0, len(still), _CHUNK)]
+        jobs += [self._threads.submit(shade_actor, item) for item in placed[1:]]
+        for job in jobs:
+            job.result()
         missed = np.flatnonzero(samples.triangle < 0)
         if len(missed):
             colour[:, missed] = self._sky(world, samples.u[missed], samples.v[missed])
@@ -63,21 +76,25 @@ class Shading:
         item: PlacedBody,
         samples: Samples,
         where: NDArray[np.int64],
-        lamp: Floats,
-        around: Floats,
+        lights: tuple[Floats, Floats],
+        flat: tuple[Floats, Floats] | None = None,
     ) -> Floats:
         """Texture times light (3, N) for samples `where` on one body.
 
-        lamp, around: (N,) shares of the lamp and of the surrounding light that arrive.
+        lights: (N,) shares of the lamp and of the surrounding light that arrive. flat: (M,) what
+        `_facing` gives, by triangle, for a body that is shaded flat.
         """
         triangle, t = samples.triangle[where], samples.t[where]
         u, v = samples.u[where], samples.v[where]
         table, light = item.body.table, self._world.light
         tiles, right, down = item.view.texture_at(triangle, t, u, v)
         rgba = self._texture(table.texture[triangle], tiles, right, down)
-        facing, upward = self._facing(item, triangle, (u, v, t))
-        facing, upward = facing * lamp, upward * around
-        downward = around - upward
+        if flat is None:
+            facing, upward = self._facing(item, triangle, (u, v, t))
+        else:
+            facing, upward = flat[0][triangle], flat[1][triangle]
+        facing, upward = facing * lights[0], upward * lights[1]
+        downward = lights[1] - upward
         tinted = rgba[3] * np.float32(1 / 255)
         clear = None if light.haze_m is None else np.exp(t * np.float32(-1 / light.haze_m))
         for channel in range(3):
@@ -99,16 +116,16 @@ class Shading:
         self, item: PlacedBody, triangle: NDArray[np.int32], at: tuple[Floats, Floats, Floats]
     ) -> tuple[Floats, Floats]:
         """Cosine towards the lamp (N,), and 0 to 1 (N,) from downward to upward, of surfaces."""
-        table, R = item.body.table, item.R_scene_body.astype(np.float32)
-        towards, up = R.T @ self._towards, -R[1]
-        if item.owner == 0:  # the still world is shaded flat: one value a triangle
-            normals = table.corner_normals[:, 0] * item.view.side[:, None]
-            facing, upward = (normals @ towards)[triangle], (normals @ up)[triangle]
-        else:
-            normals = table.smooth_normals(triangle, item.points(*at))
-            side = item.view.side[triangle]
-            facing, upward = (normals @ towards) * side, (normals @ up) * side
+        R = item.R_scene_body.astype(np.float32)
+        normals = item.body.table.smooth_normals(triangle, item.points(*at))
+        side = item.view.side[triangle]
+        facing, upward = normals @ (R.T @ self._towards) * side, normals @ -R[1] * side
         return np.maximum(facing, 0), 0.5 + 0.5 * upward
+
+    def _flat_facing(self, world: PlacedBody) -> tuple[Floats, Floats]:
+        """The same as `_facing` for each triangle (M,) of the still world, which is shaded flat."""
+        normals = world.body.table.corner_normals[:, 0] * world.view.side[:, None]
+        return np.maximum(normals @ self._towards, 0), 0.5 - 0.5 * normals[:, 1]
 
     def _texture(
         self, texture: NDArray[np.int32], tiles: Floats, right: Floats, down: Floats
@@ -120,23 +137,21 @@ class Shading:
         long, short = np.maximum(along_u, along_v), np.minimum(along_u, along_v)
         stretched = long > 2.5 * np.maximum(short, 0.36)
         out = np.empty((4, len(texture)), np.float32)
-        one = np.flatnonzero(~stretched)
-        if len(one):
-            out[:, one] = self._atlas.look_up(texture[one], tiles[0][one], tiles[1][one], long[one])
-        many = np.flatnonzero(stretched)
-        if len(many):
-            horizontal = (along_u >= along_v)[many]
-            axis_u = np.where(horizontal, right[0][many], down[0][many])
-            axis_v = np.where(horizontal, right[1][many], down[1][many])
-            start_u, start_v = tiles[0][many], tiles[1][many]
-            step = np.maximum(short, long / _TAPS**2)[many]
-            index = texture[many]
-            total = np.zeros((4, len(many)), np.uint16)
-            for k in range(_TAPS):
-                shift = np.float32((k + 0.5) / _TAPS - 0.5)
-                place = start_u + shift * axis_u, start_v + shift * axis_v
-                total += self._atlas.look_up(index, *place, step)
-            out[:, many] = total * np.float32(1 / _TAPS)
+        for which in (~stretched, stretched):
+            where = np.flatnonzero(which)
+            if not len(where):
+                continue
+            place = tiles[0][where], tiles[1][where]
+            if which is stretched:
+                horizontal = (along_u >= along_v)[where]
+                along = (
+                    np.where(horizontal, right[0][where], down[0][where]),
+                    np.where(horizontal, right[1][where], down[1][where]),
+                )
+                step2 = np.maximum(short, long / _TAPS**2)[where]
+                out[:, where] = self._atlas.look_up(texture[where], place, step2, along)
+            else:
+                out[:, where] = self._atlas.look_up(texture[where], place, long[where])
         return out
 
     def _sky(self, item: PlacedBody, u: Floats, v: Floats) -> Floats:
@@ -149,8 +164,7 @@ class Shading:
         height = np.arctan2(-y, np.hypot(x, z)) / np.float32(np.pi / 2)
         below_zenith = np.clip(1 - height, 0.002, 0.995)
         index = np.full(len(u), self._sky_index, np.int32)
-        planes = self._atlas.look_up(index, turn, below_zenith, np.ones(len(u), np.float32))
-        return planes[:3].astype(np.float32)
+        return self._atlas.look_up(index, (turn, below_zenith), np.ones(len(u), np.float32))[:3]
 
     def _darken(
         self,
