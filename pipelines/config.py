@@ -67,6 +67,7 @@ class MappingConfig:
     min_parallax_deg: float = 1.0  # deg, of a point triangulated from two keyframes
     max_reprojection_px: float = 2.0  # px at octave 0, of a triangulated point
     max_epipolar_px: float = 1.5  # px at octave 0, from the epipolar line
+    min_triangulation_baselines: float = 1.0  # baselines between keyframes to triangulate from
     triangulate_with: int = 2  # covisible keyframes that a new keyframe is matched to
     min_found_ratio: float = 0.25  # found / visible below which a point is culled (ORB-SLAM)
     min_observations: int = 3  # frames that must have seen a point of the saved map

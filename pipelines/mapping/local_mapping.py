@@ -135,8 +135,7 @@ class LocalMapping:
         """Remember the frame; triangulate what has no point yet with its neighbours."""
         free = view.features[self._away_from(view.features.uv_px, tracks.uv_px)]
         T = tracked.T_world_camera
-        neighbours = sparse_map.local_keyframes(tracks.point_ids, T)[::-1]
-        for index in neighbours[: self.config.mapping.triangulate_with]:
+        for index in self._triangulation_partners(sparse_map, tracks, T):
             new, used = self._triangulate_with(
                 sparse_map, sparse_map.keyframes[index], view, T, free
             )
@@ -144,6 +143,20 @@ class LocalMapping:
             free = free[~used]
         sparse_map.add_keyframe(Keyframe(view.frame_index, view.timestamp_s, T, tracks, free))
         return tracks
+
+    def _triangulation_partners(
+        self, sparse_map: SparseMap, tracks: Tracks, T: Array
+    ) -> NDArray[np.int64]:
+        """Local keyframes with enough baseline for parallax, the nearest of these first."""
+        indices = sparse_map.local_keyframes(tracks.point_ids, T)
+        if len(indices) == 0:
+            return indices
+        centres = np.stack([sparse_map.keyframes[i].T_world_camera[:3, 3] for i in indices])
+        distance = np.linalg.norm(centres - T[:3, 3], axis=1)
+        shortest = self.config.mapping.min_triangulation_baselines * self.camera.baseline_m
+        apart = np.flatnonzero(distance >= shortest)
+        nearest = apart[np.argsort(distance[apart], kind="stable")]
+        return indices[nearest[: self.config.mapping.triangulate_with]]
 
     def _triangulate_with(
         self, sparse_map: SparseMap, other: Keyframe, view: View, T: Array, free: Features

@@ -327,6 +327,9 @@ def _side_street(road: Road, junction: float, rng: np.random.Generator) -> list[
             rim = sorted((edge, edge + 2.0 * away))
             span = (inner + 0.4 * outward, outer)
             parts.append(road.strip((rim[0], rim[1]), span, (_KERB_M,) * 2, "paving", 8))
+            x, z, _ = road.at(np.array([edge, edge]), np.array(span))
+            kerb = [[(a, -_KERB_M, b), (a, 0, b)] for a, b in zip(x, z, strict=True)]
+            parts.append(surface(kerb, "concrete"))
         begin = (_FRONTS[0] - 8.9) if outward < 0 else (_FRONTS[1] + 8.9)
         for k in range(2):
             near = begin + outward * 11.5 * k
