@@ -39,7 +39,7 @@ from pipelines.errors import ConfigError, FrameError
 from pipelines.geometry import invert_T, make_T
 from pipelines.types import Array, Frame, GroundTruth, Image, ObjectTruth
 
-VERSION = 3  # of what the same scene and seed look like: raise it when that changes
+VERSION = 4  # of what the same scene and seed look like: raise it when that changes
 INPUTS = ("depth", "flow", "masks", "right")
 Progress = Callable[[int, int], None]
 _FLOW_STEP_PX = 1 / 64  # computed flow is stored in these units, far below its errors
@@ -71,7 +71,8 @@ class SimulatedSequence(Sequence):
         spec: name of the scene, with or without `simulated:`. frames, scale: length, and size as
         a share of the scene's own. degrade: see `Degradation.of`. provide: which of depth, flow,
         masks and right the frames bring. progress: called with (done, total) frames of each stage
-        that is rendered: left, right, degraded. Raises DatasetError for an unknown scene, ConfigError for a bad option.
+        that is rendered: left, right, degraded.
+        Raises DatasetError for an unknown scene, ConfigError for a bad option.
         """
         self._scene: Scene = find_scene(_scene_name(spec))
         self._frames = self._scene.frames if frames is None else int(frames)

@@ -25,13 +25,13 @@ from pipelines.datasets.simulated.buildings import (
 from pipelines.datasets.simulated.facades import FACADES
 from pipelines.datasets.simulated.meshes import WHITE, Mesh, box, merge, pose, surface
 from pipelines.datasets.simulated.people import WARDROBE, walker_mesh
+from pipelines.datasets.simulated.road import BLOCK_M, Road
 from pipelines.datasets.simulated.textures import SURFACES
 from pipelines.datasets.simulated.vehicles import SHAPES, VEHICLE_ART, car_mesh
 from pipelines.datasets.simulated.world import Actor, Light, World
 from pipelines.types import Array, StereoCamera
 
 FPS = 10.0
-_BLOCK_M = 84.0  # length of the repeating script
 _CROSSING_S, _ZEBRA_S = 52.0, 43.5
 _LEFT_LANE, _ONCOMING = -3.2, -6.6
 _KERBS = (-10.6, 4.2)
@@ -48,52 +48,6 @@ _PAINTS = (
 Along = Callable[[Array], Array]
 
 
-class Road:
-    """The camera's lane as a curve in the plane, sampled every 10 cm."""
-
-    def __init__(self, length_m: float) -> None:
-        self.start_s, self.end_s = -45.0, length_m
-        self._s = np.arange(self.start_s, self.end_s + 0.2, 0.1)
-        block, local = np.divmod(self._s, _BLOCK_M)
-        inside = (local > 3) & (local < 37) & (self._s > 0)
-        bend = np.where(inside, np.sin((local - 3) / 34 * np.pi) ** 2, 0)
-        curvature = 0.021 * bend * np.where(block % 2 == 0, 1, -1)
-        zero = np.searchsorted(self._s, 0.0)
-        self._psi, self._x, self._z = (np.zeros_like(self._s) for _ in range(3))
-        self._psi[1:] = np.cumsum((curvature[1:] + curvature[:-1]) / 2 * 0.1)
-        self._x[1:] = np.cumsum(np.sin(self._psi[1:]) * 0.1)
-        self._z[1:] = np.cumsum(np.cos(self._psi[1:]) * 0.1)
-        self._x -= self._x[zero]
-        self._z -= self._z[zero]
-
-    def at(self, s: Array, lateral: Array | float) -> tuple[Array, Array, Array]:
-        """x, z and heading (rad, clockwise from z) at `s` and `lateral` metres to the right."""
-        psi = np.interp(s, self._s, self._psi)
-        x = np.interp(s, self._s, self._x) + lateral * np.cos(psi)
-        z = np.interp(s, self._s, self._z) - lateral * np.sin(psi)
-        return x, z, psi
-
-    def pose(self, s: float, lateral: float, y: float = 0.0, turn_rad: float = 0.0) -> Array:
-        x, z, psi = self.at(np.array(s), lateral)
-        return pose(float(x), y, float(z), float(psi) + turn_rad)
-
-    def strip(
-        self, s: tuple[float, float], lateral: tuple[float, float], heights: tuple[float, float],
-        texture: str, columns: int = 2,
-    ) -> Mesh:  # fmt: skip
-        """Ribbon along the road between two laterals, at heights above the ground."""
-        along = np.arange(s[0], s[1] + 0.01, min(1.5, s[1] - s[0]))
-        if along[-1] < s[1] - 0.01:
-            along = np.append(along, s[1])
-        across = np.linspace(*lateral, columns)
-        height = np.linspace(*heights, columns)
-        x, z, _ = self.at(along[:, None], across[None])
-        points = np.stack([x, np.broadcast_to(-height, x.shape), z], -1)
-        rise = np.append(0, np.hypot(np.diff(across), np.diff(height)).cumsum())
-        uv = np.stack(np.broadcast_arrays(across[0] + rise[None], along[:, None]), -1)
-        return surface(points, texture, uv=uv)
-
-
 def make_street(
     frames: int, seed: int, camera: StereoCamera, fps: float = FPS, still: bool = False
 ) -> World:
@@ -102,7 +56,7 @@ def make_street(
     times = np.arange(frames + 1) / fps
     ego = _ego_s(times)
     road = Road(float(ego[-1]) + _AHEAD_M)
-    blocks = range(int(ego[-1] // _BLOCK_M) + 2)
+    blocks = range(int(ego[-1] // BLOCK_M) + 2)
     script = _Script(road, times, rng)
     script.park(blocks)
     if not still:
@@ -181,7 +135,7 @@ class _Script:
         """Cars along both kerbs; not at crossings and where a script needs the place."""
         for side, lateral in enumerate(_PARKED):
             for s in np.arange(-8.0, self.road.end_s - 25, 6.1):
-                local = s % _BLOCK_M
+                local = s % BLOCK_M
                 junction = abs(local - (_CROSSING_S + _ZEBRA_S) / 2) < 14
                 taken = side == 0 and abs(local - 24) < 7
                 if junction or taken or self.rng.random() < 0.28:
@@ -199,7 +153,7 @@ class _Script:
         self._car(self._follow(s, lambda s: 0.1 * np.sin(s / 19)), True, "hatchback")
 
     def block(self, block: int) -> None:
-        s0 = block * _BLOCK_M
+        s0 = block * BLOCK_M
         tau = self.times - _ego_time(s0)
         constant = partial(np.full_like, dtype=float)
         overtaking = _ego_s(self.times) - 3.0 + 5.0 * tau
@@ -267,8 +221,8 @@ def _stopping_s(tau: Array) -> Array:
 def _static(road: Road, rng: np.random.Generator) -> Mesh:
     ends = (road.start_s, road.end_s)
     junctions = [
-        k * _BLOCK_M + _CROSSING_S for k in range(-1, int(road.end_s // _BLOCK_M) + 1)
-        if road.start_s < k * _BLOCK_M + _CROSSING_S < road.end_s - 30
+        k * BLOCK_M + _CROSSING_S for k in range(-1, int(road.end_s // BLOCK_M) + 1)
+        if road.start_s < k * BLOCK_M + _CROSSING_S < road.end_s - 30
     ]  # fmt: skip
     parts = [road.strip(ends, _KERBS, (0.0, 0.0), "asphalt", 4)]
     open_ends = [road.start_s, *(x for j in junctions for x in (j - 5.0, j + 5.0)), road.end_s]
@@ -325,7 +279,7 @@ def _side_street(road: Road, junction: float, rng: np.random.Generator) -> list[
         parts.append(road.strip(s, (inner, outer), (0.0, 0.0), "asphalt", 8))
         for edge, away in ((s[0], -1), (s[1], 1)):
             rim = sorted((edge, edge + 2.0 * away))
-            span = (inner + 0.4 * outward, outer)
+            span = (inner, outer)
             parts.append(road.strip((rim[0], rim[1]), span, (_KERB_M,) * 2, "paving", 8))
             x, z, _ = road.at(np.array([edge, edge]), np.array(span))
             kerb = [[(a, -_KERB_M, b), (a, 0, b)] for a, b in zip(x, z, strict=True)]
