@@ -65,8 +65,8 @@ def other_place(render_cache) -> Sequence:
 
 @pytest.fixture(scope="session")
 def stereo_street(render_cache) -> Sequence:
-    """Eight pairs of a street without traffic."""
-    options = {"frames": 8, "scale": SCALE, "provide": "right", "cache": render_cache}
+    """Six pairs of a street without traffic."""
+    options = {"frames": 6, "scale": SCALE, "provide": "right", "cache": render_cache}
     return open_sequence("simulated:static", **options)
 
 
