@@ -26,7 +26,7 @@ from viz.views import VIEW_NAMES, choose_view
 logger = logging.getLogger("dyob.viz")
 
 RENDERERS = ("auto", "open3d", "splat")
-POINT_SHARE = 0.0011  # radius of a point as a share of the map's extent
+POINT_SHARE = 0.001  # radius of a point as a share of the map's extent
 LIGHTEST = 0.82  # colours are scaled down to this on white, where lighter ones would vanish
 
 

@@ -14,7 +14,8 @@ from viz.scene import Scene, View
 SIDE_MARGIN, TOP_MARGIN, BOTTOM_MARGIN = 0.06, 0.15, 0.12
 TOP_DISTANCE = 60.0  # extents above the map: so far that heights hardly shift anything
 FIELD_OF_VIEW_DEG = 55.0  # of the perspective view, across the picture
-ELONGATED = 0.5  # a path this long, against the map's extent, is followed; else the map is viewed
+ELONGATED = 0.3  # a path this long, against the map's extent, is followed; else the map is viewed
+WIDEST = 0.4  # a path that strays this far aside, against its length, is no way to look along
 VIEW_NAMES = ("top", "perspective")
 
 
@@ -52,13 +53,15 @@ def perspective_view(scene: Scene, size: tuple[int, int]) -> View:
     across = across - np.outer(across @ scene.up, scene.up)
     reach = np.linalg.norm(across, axis=1)
     length_m = float(reach.max())
-    if length_m > ELONGATED * float(np.linalg.norm(np.ptp(framed, axis=0))):
-        along = across[int(reach.argmax())] / length_m
+    along = across[int(reach.argmax())] / max(length_m, 1e-9)
+    aside_m = float(np.linalg.norm(across - np.outer(across @ along, along), axis=1).max())
+    is_long = length_m > ELONGATED * float(np.linalg.norm(np.ptp(framed, axis=0)))
+    if is_long and aside_m < WIDEST * length_m:
         aside = np.cross(scene.up, along)
-        eye = start + length_m * (-0.30 * along + 0.18 * scene.up + 0.07 * aside)
-        target = start + 0.25 * length_m * along
+        eye = start + length_m * (-0.34 * along + 0.17 * scene.up + 0.04 * aside)
+        target = start + 0.35 * length_m * along
         return View("perspective", size, _intrinsics(size, focal), _look_at(eye, target, scene.up))
-    direction = _unit(0.80 * scene.forward - 0.60 * scene.up)
+    direction = _unit(0.87 * scene.forward - 0.50 * scene.up)
     R = _axes(np.cross(scene.forward, scene.up), direction)
     return View("perspective", size, _intrinsics(size, focal), _fit(R, framed, focal, size))
 
