@@ -13,6 +13,17 @@ from typing import Any, cast
 from pipelines.errors import ConfigError
 from pipelines.settings import build, describe, merge, to_plain
 
+_ANY = float("inf")
+
+
+def _check(section: object, **ranges: tuple[float, float]) -> None:
+    """Raise ValueError unless each named setting lies within its range, ends included."""
+    for name, (low, high) in ranges.items():
+        value = getattr(section, name)
+        if not low <= value <= high:
+            limit = f"at least {low:g}" if high == _ANY else f"{low:g} to {high:g}"
+            raise ValueError(f"{name}: expected {limit}, found {value:g}")
+
 
 @dataclass(frozen=True, slots=True)
 class DepthConfig:
@@ -25,6 +36,11 @@ class DepthConfig:
     sgbm_block_size: int = 3  # px, odd
     left_right_max_px: float = 1.0  # px, left-right check of disparities
 
+    def __post_init__(self) -> None:
+        _check(self, close_baselines=(1, _ANY), max_depth_m=(0, _ANY), relative_error=(1e-4, 1))
+        _check(self, sgbm_num_disparities=(16, 1024), sgbm_block_size=(1, 21))
+        _check(self, left_right_max_px=(0, _ANY))
+
 
 @dataclass(frozen=True, slots=True)
 class OrbConfig:
@@ -35,6 +51,10 @@ class OrbConfig:
     scale_factor: float = 1.2  # between levels (paper, as ORB-SLAM)
     fast_threshold: int = 24  # grey levels, FAST corner threshold after contrast is evened
     mask_dilation_px: int = 7  # px, movable masks grow by this before features are kept off them
+
+    def __post_init__(self) -> None:
+        _check(self, n_features=(50, 20000), n_levels=(1, 16), scale_factor=(1.01, 4))
+        _check(self, fast_threshold=(1, 100), mask_dilation_px=(0, 100))
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +74,12 @@ class TrackingConfig:
     use_rgbd_odometry: bool = True  # Open3D's dense odometry as the third hypothesis
     calibrate_disparity: bool = True  # learn a constant error of the stereo disparities
 
+    def __post_init__(self) -> None:
+        _check(self, seed=(0, 2**31 - 1), search_radius_px=(1, 500), flow_tolerance_px=(0, 100))
+        _check(self, map_radius_px=(1, 100), max_hamming=(0, 256), inlier_px=(0.1, 50))
+        _check(self, weak_inlier_share=(0, 1), min_inliers=(6, _ANY))
+        _check(self, min_points_apart_px=(0, 100), restart_after_frames=(1, _ANY))
+
 
 @dataclass(frozen=True, slots=True)
 class MappingConfig:
@@ -72,6 +98,15 @@ class MappingConfig:
     min_found_ratio: float = 0.25  # found / visible below which a point is culled (ORB-SLAM)
     min_observations: int = 3  # frames that must have seen a point of the saved map
     max_relative_depth_sigma: float = 0.1  # standard deviation / distance of a saved point
+
+    def __post_init__(self) -> None:
+        _check(self, keyframe_min_overlap=(0, 1), keyframe_max_interval=(1, _ANY))
+        _check(self, local_keyframes=(1, _ANY), near_keyframe_baselines=(0, _ANY))
+        _check(self, min_shared_points=(1, _ANY), min_parallax_deg=(0.01, 90))
+        _check(self, max_reprojection_px=(0.1, 50), max_epipolar_px=(0.1, 50))
+        _check(self, min_triangulation_baselines=(0, _ANY), triangulate_with=(0, _ANY))
+        _check(self, min_found_ratio=(0, 1), min_observations=(1, _ANY))
+        _check(self, max_relative_depth_sigma=(1e-4, _ANY))
 
 
 @dataclass(frozen=True, slots=True)
