@@ -98,7 +98,7 @@ def render(arguments: Namespace) -> int:
 
 
 def _process(sequence: Any, config: Any, arguments: Namespace, span: dict[str, Any]) -> Any:
-    from pipelines.run import run as run_sequence
+    from pipelines.runner import run as run_sequence
     from viz.overlay import FrameWriter
 
     sinks: list[Any] = [] if arguments.quiet else [console.Progress()]

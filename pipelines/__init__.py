@@ -12,7 +12,7 @@ from typing import Any
 _PUBLIC = {
     "open_sequence": "pipelines.datasets",
     "DyObSlam": "pipelines.dyob_slam",
-    "run": "pipelines.run",
+    "run": "pipelines.runner",
     "load_result": "pipelines.io.result",
 }
 __all__ = ["DyObSlam", "load_result", "open_sequence", "run"]

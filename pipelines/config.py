@@ -69,6 +69,7 @@ class TrackingConfig:
     inlier_px: float = 2.0  # px, reprojection error of an inlier of a motion hypothesis
     weak_inlier_share: float = 0.5  # below this share of inliers, dense odometry joins in
     min_inliers: int = 20  # fewer than this after bundle adjustment is LOST
+    min_inlier_share: float = 0.1  # so is a smaller share of the points measured
     min_points_apart_px: float = 5.0  # px, new points keep this far from tracked ones
     restart_after_frames: int = 5  # LOST frames with features before tracking starts anew
     use_rgbd_odometry: bool = True  # Open3D's dense odometry as the third hypothesis
@@ -77,7 +78,7 @@ class TrackingConfig:
     def __post_init__(self) -> None:
         _check(self, seed=(0, 2**31 - 1), search_radius_px=(1, 500), flow_tolerance_px=(0, 100))
         _check(self, map_radius_px=(1, 100), max_hamming=(0, 256), inlier_px=(0.1, 50))
-        _check(self, weak_inlier_share=(0, 1), min_inliers=(6, _ANY))
+        _check(self, weak_inlier_share=(0, 1), min_inlier_share=(0, 1), min_inliers=(6, _ANY))
         _check(self, min_points_apart_px=(0, 100), restart_after_frames=(1, _ANY))
 
 

@@ -65,10 +65,10 @@ def estimate_pnp(
     """T_world_camera (4, 4) by PnP RANSAC (AP3P) from points (N, 3) and pixels (N, 2), or None."""
     if len(points_world_m) < 6:
         return None
-    cv2.setRNGSeed(seed)
+    order = np.random.default_rng(seed).permutation(len(points_world_m))  # OpenCV's is fixed
     found, rotation, translation, _ = cv2.solvePnPRansac(
-        points_world_m,
-        uv_px,
+        points_world_m[order],
+        uv_px[order],
         camera.K,
         None,
         iterationsCount=_RANSAC_ITERATIONS,

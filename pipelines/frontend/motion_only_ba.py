@@ -21,6 +21,9 @@ from pipelines.types import Array, StereoCamera
 
 CHI2_95_2DOF = 5.991  # chi-square, 95 %, of a pixel (u_L, v)
 CHI2_95_3DOF = 7.815  # chi-square, 95 %, of a stereo pixel (u_L, v, u_R)
+_CHI2_MEDIAN_2DOF, _CHI2_MEDIAN_3DOF = 1.386, 2.366
+_NOISY = 3.0  # times the expected median of chi-square
+_MAX_NOISE_FACTOR = 2.0  # a frame may be this much noisier than the ones before
 _MIN_POINTS = 6  # fewer cannot be told from an accident
 _ROBUST_ROUNDS = 2  # solve with Huber's kernel, reject by chi-square, solve again
 _MAX_ITERATIONS = 10  # Levenberg-Marquardt steps per round
@@ -91,6 +94,7 @@ def estimate_camera_pose(
     for _ in range(_ROBUST_ROUNDS):
         problem = _Problem(camera, T, observations)
         T = problem.minimise(T, used, robust=True)
+        problem.allow_for_noise(T)
         used = problem.chi2(T) <= problem.limit
         if used.sum() < _MIN_POINTS:
             break
@@ -154,6 +158,16 @@ class _Problem:
         W = whitening(observation_covariance(camera, T, observations))
         W[self.mono, 2] = 0.0  # the first two rows do not know of the third
         self.W = W.transpose(1, 2, 0).copy()
+
+    def allow_for_noise(self, T: Array) -> None:
+        """Widen all weights where this frame is so noisy that half of it would be rejected.
+
+        The median of chi-square says by how much; it may at most double the standard deviations.
+        """
+        expected = np.where(self.mono, _CHI2_MEDIAN_2DOF, _CHI2_MEDIAN_3DOF)
+        excess = float(np.median(self.chi2(T) / expected))
+        if excess > _NOISY:
+            self.W /= min(np.sqrt(excess), _MAX_NOISE_FACTOR)
 
     def _in_camera(self, T: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
         """x, y, 1 / z of the points in the camera, each (N,), and which are in front of it."""

@@ -6,6 +6,10 @@ that rest on points are weak, and must win by inliers like them.
 
 from __future__ import annotations
 
+import os
+import sys
+from functools import cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -30,9 +34,8 @@ def estimate_rgbd_odometry(
     Depths are NaN where unknown *or dynamic*: moving pixels must be unknown in both frames.
     T_prev_curr: the guess that seeds the iteration.
     """
-    import open3d as o3d
-    from open3d.t.pipelines import odometry
-
+    o3d = _import_open3d()
+    odometry = o3d.t.pipelines.odometry
     if min(np.isfinite(depth).sum() for _, depth in (previous, current)) < _MIN_VALID_PIXELS:
         return None
     source, target = (_rgbd_image(o3d, *view, max_depth_m) for view in (current, previous))
@@ -52,6 +55,24 @@ def estimate_rgbd_odometry(
         return None
     T = result.transformation.numpy()
     return T if np.isfinite(T).all() else None
+
+
+@cache
+def _import_open3d() -> Any:
+    """Open3D with one thread, so that its parallel sums come out the same every time.
+
+    Its thread pool is sized when it is loaded, by the cores that the loading thread may use. Where
+    something else has loaded it before (rendering a simulated scene does), results may differ in
+    the last digits from run to run.
+    """
+    if "open3d" in sys.modules or not hasattr(os, "sched_setaffinity"):
+        return import_module("open3d")
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        return import_module("open3d")
+    finally:
+        os.sched_setaffinity(0, allowed)
 
 
 def _rgbd_image(o3d: Any, gray: Image, depth_m: NDArray[np.float32], max_depth_m: float) -> Any:

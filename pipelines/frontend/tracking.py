@@ -34,6 +34,7 @@ from pipelines.mapping.sparse_map import SparseMap
 from pipelines.types import Array, MotionHypothesis, TrackingStatus
 
 _ALIGNMENT_TOLERANCE_PX = 10.0  # alignment may move a point this far from an ORB match
+_RELOCALISED_SHARE = 0.5  # of descriptor matches that must agree with a pose found by them
 _RELOCALISE_AGAINST = 5  # latest keyframes tried when lost
 _NEIGHBOURS = 5  # matched points that predict the place of an unmatched one
 
@@ -101,12 +102,14 @@ class Tracker:
         T_predicted = self.motion.predict(view.timestamp_s)
         with stage("track"):
             hypothesis, T, measured = self._initial_pose(view, sparse_map, T_predicted)
-        if len(measured.tracks) < self.config.min_inliers:
+        seen = min(len(measured.tracks), len(view.features))  # flow alone is no sight: black frames
+        if seen < self.config.min_inliers:
             return self._lost(T_predicted, measured.tracks)
         with stage("pose"):
             estimate = self._adjust(sparse_map, measured.tracks, T)
             self._learn_noise(sparse_map, measured, estimate)
-        if estimate.n_inliers < self.config.min_inliers:
+        share = estimate.n_inliers / len(measured.tracks)
+        if estimate.n_inliers < self.config.min_inliers or share < self.config.min_inlier_share:
             return self._lost(T_predicted, measured.tracks)
         with stage("local_map"):
             found, visible = self._search_local_map(view, sparse_map, measured.tracks, estimate)
@@ -223,7 +226,8 @@ class Tracker:
         if T is None:
             return name, None
         n = reprojection_inliers(self.camera, T, world, uv, 2.0 * self.config.inlier_px).sum()
-        return name, T if n >= self.config.min_inliers else None
+        enough = max(self.config.min_inliers, _RELOCALISED_SHARE * len(world))
+        return name, T if n >= enough else None
 
     # ----------------------------------------------------------- measurement
 

@@ -51,6 +51,23 @@ def create_result_folder(root: Path | str, name: str) -> Path:
     return folder
 
 
+def clear_result_folder(folder: Path | str) -> None:
+    """Remove what an earlier run left in `folder`: the files named above and nothing else."""
+    folder = Path(folder)
+    files = [CONFIG, LOG, CAMERA_TUM, CAMERA_KITTI, CAMERA_GT_TUM, STATIC_MAP]
+    stale = [folder / name for name in (*files, METRICS_JSON, METRICS_TXT, TIMINGS)]
+    for name in (FRAMES, PLOTS, RENDERS):
+        stale += [*(folder / name).glob("*.png"), *(folder / name).glob("*.jpg")]
+    try:
+        for path in stale:
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise DyObError(
+            f"{path}: expected to replace an earlier run's file, found '{error.strerror}'; "
+            "choose another --output"
+        ) from error
+
+
 def _first_free(root: Path, base: str) -> Path:
     number = 1
     while True:

@@ -45,10 +45,9 @@ class LocalMapping:
         Returns the tracks that the next frame will follow, and whether this is a keyframe.
         """
         tracks = tracked.tracks[tracked.inliers]
-        sparse_map.record_sight(
-            np.concatenate([tracked.visible_ids, tracked.tracks.point_ids]), tracks.point_ids
-        )
-        self._refine(sparse_map, tracked, tracks)
+        visible = np.union1d(tracked.visible_ids, tracked.tracks.point_ids)
+        sparse_map.record_sight(visible, tracks.point_ids)
+        self._refine(sparse_map, tracked, tracks, visible)
         free = self.mappable_features(view, tracks)
         budget = max(0, self.config.orb.n_features - len(tracks))
         new = self._add_points(sparse_map, view, tracked.T_world_camera, free[:budget])
@@ -57,7 +56,7 @@ class LocalMapping:
         is_keyframe = needs_keyframe(self.config.mapping, tracks, last, view.frame_index)
         if is_keyframe:
             tracks = self._add_keyframe(sparse_map, view, tracked, tracks)
-        sparse_map.cull_points(tracks.point_ids)
+        sparse_map.cull_points(tracks.point_ids, visible)
         return tracks[sparse_map.alive[tracks.point_ids]], is_keyframe
 
     def mappable_features(self, view: View, tracks: Tracks) -> NDArray[np.int64]:
@@ -77,7 +76,13 @@ class LocalMapping:
         distance, _ = cKDTree(occupied_px).query(uv_px, distance_upper_bound=apart)
         return ~np.isfinite(distance)
 
-    def _refine(self, sparse_map: SparseMap, tracked: TrackedFrame, tracks: Tracks) -> None:
+    def _refine(
+        self,
+        sparse_map: SparseMap,
+        tracked: TrackedFrame,
+        tracks: Tracks,
+        visible: NDArray[np.int64],
+    ) -> None:
         if len(tracks) == 0:
             return
         ids, T = tracks.point_ids, tracked.T_world_camera
@@ -87,7 +92,7 @@ class LocalMapping:
             pose_slope = self.sensor.offset.learn(
                 self.camera, T, observations, sparse_map.offset_slope[ids]
             )
-            sparse_map.shift_offset(T, pose_slope, self.sensor.offset.step())
+            sparse_map.shift_offset(visible, T, pose_slope, self.sensor.offset.step())
             observations = sparse_map.observe(tracks, sigma)
         points, covariances, slopes = refine_points(
             self.camera, T, tracked.covariance, observations, sparse_map.offset_slope[ids]

@@ -56,6 +56,8 @@ class SparseMap:
         self._covisible: list[Ids] = []  # per keyframe, its covisible ones, most shared first
         self._size = 0
         self._free = np.empty(0, np.int64)
+        self._young = np.empty(0, np.int64)  # points that no keyframe has seen yet
+        self._keyframe_Ts = np.empty((0, 4, 4))
         for name, (shape, dtype) in _COLUMNS.items():
             setattr(self, name, np.zeros((4096, *shape), dtype))
 
@@ -80,6 +82,7 @@ class SparseMap:
         self.n_keyframes[ids] = 0
         self.first_keyframe[ids] = -1
         self.alive[ids] = True
+        self._young = np.concatenate([self._young, ids])
         return ids
 
     def _allocate(self, n: int) -> Ids:
@@ -108,31 +111,36 @@ class SparseMap:
             np.full(len(ids), sigma_disparity_px),
         )
 
-    def shift_offset(self, T_world_camera: Array, pose_slope: Array, step_px: float) -> None:
-        """Let all points follow a new disparity offset, with the present camera held still."""
-        used = slice(0, self._size)
-        self.offset_slope[used] += follow_camera(T_world_camera, self.position_m[used], pose_slope)
-        self.position_m[used] += step_px * self.offset_slope[used]
+    def shift_offset(
+        self, ids: Ids, T_world_camera: Array, pose_slope: Array, step_px: float
+    ) -> None:
+        """Let points follow a new disparity offset, with the present camera held still."""
+        slope = self.offset_slope[ids]
+        slope += follow_camera(T_world_camera, self.position_m[ids], pose_slope)
+        self.offset_slope[ids] = slope
+        self.position_m[ids] += step_px * slope
 
     def record_sight(self, visible_ids: Ids, found_ids: Ids) -> None:
         """Count which points a frame should have seen, and which it did see."""
         self.n_visible[visible_ids] += 1
         self.n_found[found_ids] += 1
 
-    def cull_points(self, tracked_ids: Ids) -> None:
+    def cull_points(self, tracked_ids: Ids, visible_ids: Ids) -> None:
         """Forget points that proved no good: lost while young, or mostly not found where visible.
 
         Points that no keyframe saw free their rows; others only die, as keyframes name them.
         """
-        alive = np.flatnonzero(self.alive[: self._size])
         tracked = np.zeros(self._size, bool)
         tracked[tracked_ids] = True
-        young = self.n_keyframes[alive] == 0
-        finite = np.isfinite(self.position_m[alive]).all(1)
-        ratio = self.n_found[alive] / np.maximum(self.n_visible[alive], 1)
-        poor = (self.n_visible[alive] >= 8) & (ratio < self.config.min_found_ratio)
-        doomed = alive[(young & ~tracked[alive]) | (poor & ~tracked[alive]) | ~finite]
+        self._young = self._young[self.n_keyframes[self._young] == 0]
+        ratio = self.n_found[visible_ids] / np.maximum(self.n_visible[visible_ids], 1)
+        poor = (self.n_visible[visible_ids] >= 8) & (ratio < self.config.min_found_ratio)
+        broken = tracked_ids[~np.isfinite(self.position_m[tracked_ids]).all(axis=1)]
+        doomed = np.concatenate([self._young, visible_ids[poor]])
+        doomed = np.unique(np.concatenate([doomed[~tracked[doomed]], broken]))
+        doomed = doomed[self.alive[doomed]]
         self.alive[doomed] = False
+        self._young = self._young[self.alive[self._young]]
         self._free = np.concatenate([self._free, doomed[self.n_keyframes[doomed] == 0]])
 
     # ------------------------------------------------------------- keyframes
@@ -154,6 +162,7 @@ class SparseMap:
         self.first_keyframe[new] = index
         self.n_keyframes[ids] += 1
         self.keyframes.append(keyframe)
+        self._keyframe_Ts = np.concatenate([self._keyframe_Ts, keyframe.T_world_camera[None]])
 
     def covisible_keyframes(self, index: int) -> Ids:
         """Positions in `keyframes` of those that share points with keyframe `index`."""
@@ -175,7 +184,7 @@ class SparseMap:
 
     def _near_keyframes(self, T_world_camera: Array) -> Ids:
         """The keyframes nearest in place that look the same way, within sight of their points."""
-        Ts = np.stack([k.T_world_camera for k in self.keyframes])
+        Ts = self._keyframe_Ts
         distance = np.linalg.norm(Ts[:, :3, 3] - T_world_camera[:3, 3], axis=1)
         cosine = Ts[:, :3, 2] @ T_world_camera[:3, 2]
         reach = self.config.near_keyframe_baselines * self.camera.baseline_m
@@ -208,9 +217,8 @@ class SparseMap:
     def snapshot(self) -> StaticMap:
         """The well-measured points and all keyframe poses, copied for the outside."""
         ids = np.flatnonzero(self.alive[: self._size] & (self.n_keyframes[: self._size] > 0))
-        centres = np.stack([k.T_world_camera[:3, 3] for k in self.keyframes] or [np.zeros(3)])
-        nearest = centres[np.maximum(self.first_keyframe[ids], 0)]
-        distance = np.linalg.norm(self.position_m[ids] - nearest, axis=1)
+        seen_from = self._keyframe_Ts[self.first_keyframe[ids], :3, 3]
+        distance = np.linalg.norm(self.position_m[ids] - seen_from, axis=1)
         spread = np.sqrt(np.trace(self.covariance_m2[ids], axis1=1, axis2=2))
         good = (self.n_found[ids] >= self.config.min_observations) & (
             spread < self.config.max_relative_depth_sigma * distance
@@ -220,8 +228,6 @@ class SparseMap:
             self.position_m[ids].copy(),
             self.color[ids].copy(),
             self.n_found[ids].copy(),
-            np.stack([k.T_world_camera for k in self.keyframes])
-            if self.keyframes
-            else np.empty((0, 4, 4)),
+            self._keyframe_Ts.copy(),
             np.array([k.frame_index for k in self.keyframes], np.int64),
         )

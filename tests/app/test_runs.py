@@ -31,7 +31,7 @@ def calls(monkeypatch, tmp_path) -> dict[str, Any]:
         seen.update(rendered=folder, options=options)
         return [Path(folder) / "renders" / "top.png"]
 
-    for name, function in (("pipelines.run", run), ("viz.render", render_result)):
+    for name, function in (("pipelines.runner", run), ("viz.render", render_result)):
         module = ModuleType(name)
         setattr(module, function.__name__, function)
         monkeypatch.setitem(sys.modules, name, module)

@@ -24,7 +24,7 @@ import pytest
 from pipelines.datasets import open_sequence
 from pipelines.errors import DatasetError
 from pipelines.io.result import Result, load_result
-from pipelines.run import run
+from pipelines.runner import run
 
 ROOT = Path(__file__).resolve().parents[2]
 

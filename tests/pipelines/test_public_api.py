@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import pipelines
+from pipelines.io.trajectory import read_tum
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -28,6 +29,16 @@ for index in range(len(sequence)):
     x, y, z = result.T_world_camera[:3, 3]
     print(index, result.status, x, y, z)
 print(len(slam.static_map()), "points")
+"""
+
+WHOLE_RUN = """
+import sys
+from pipelines import load_result, open_sequence, run
+
+result = run(open_sequence(sys.argv[1]), output=sys.argv[2], frames=4)
+print(result.metrics["run"]["tracked"], "frames tracked")
+again = load_result(result.folder)
+print(len(again.timestamps_s), "poses,", len(again.static_points_m), "points")
 """
 
 
@@ -55,7 +66,14 @@ def test_the_system_frame_by_frame(vdo_folder) -> None:
     assert int(lines[-1].split()[0]) > 100
 
 
-@pytest.mark.parametrize("name", ["DyObSlam", "load_result", "open_sequence"])
+def test_a_whole_run_and_its_result(vdo_folder, tmp_path) -> None:
+    lines = execute(WHOLE_RUN, vdo_folder, tmp_path / "result")
+    assert lines[0] == "4 frames tracked"
+    assert lines[1].startswith("4 poses,")
+    assert len(read_tum(tmp_path / "result/camera_tum.txt")[0]) == 4
+
+
+@pytest.mark.parametrize("name", pipelines.__all__)
 def test_each_name_stays_itself_when_imported_twice(name: str) -> None:
     """A submodule of the same name must not take its place once it is loaded."""
     script = (

@@ -15,7 +15,7 @@ import numpy as np
 from pipelines.datasets import open_sequence
 from pipelines.geometry import invert_T, rotation_angle_deg
 from pipelines.io.result import Result
-from pipelines.run import run
+from pipelines.runner import run
 
 
 def run_real(path: Path, tmp_path: Path, frames: int | None = None) -> Result:

@@ -17,7 +17,7 @@ from pipelines.datasets import open_sequence
 from pipelines.errors import DatasetError
 from pipelines.io.ply import read_point_cloud
 from pipelines.io.result import Result, load_result
-from pipelines.run import run
+from pipelines.runner import run
 from pipelines.types import Frame, FrameResult, TrackingStatus
 
 ESTIMATES = ("camera_tum.txt", "camera_kitti.txt", "static_map.ply")

@@ -64,7 +64,7 @@ class Drive:
         T, kept = estimate.T_world_camera, estimate.inliers
         rows, slopes = rows[kept], self.map.offset_slope[rows[kept]]
         pose_slope = self.offset.learn(CAMERA, T, observations[kept], slopes)
-        self.map.shift_offset(T, pose_slope, self.offset.step())
+        self.map.shift_offset(rows, T, pose_slope, self.offset.step())
         observations = self.map.observe(tracks[kept], SIGMA_DISPARITY_PX)
         points, covariances, slopes = refine_points(
             CAMERA, T, estimate.covariance, observations, self.map.offset_slope[rows]

@@ -73,7 +73,7 @@ def test_rows_are_used_again_only_where_no_keyframe_saw_the_point():
     ids = sparse_map.add_points(*random_points(100))
     seen = ids[:40]
     sparse_map.add_keyframe(keyframe_of(seen))
-    sparse_map.cull_points(NOTHING)  # the young sixty die
+    sparse_map.cull_points(NOTHING, NOTHING)  # the young sixty die
     assert sparse_map.alive[ids].tolist() == [True] * 40 + [False] * 60
     again = sparse_map.add_points(*random_points(80, seed=1))
     assert np.isin(again, ids[40:]).sum() == 60
@@ -88,7 +88,7 @@ def test_a_row_is_not_given_out_twice():
     sparse_map = new_map()
     ids = sparse_map.add_points(*random_points(30))
     for _ in range(3):
-        sparse_map.cull_points(ids[:10])
+        sparse_map.cull_points(ids[:10], NOTHING)
     a = sparse_map.add_points(*random_points(15, seed=1))
     b = sparse_map.add_points(*random_points(15, seed=2))
     assert len(np.unique(np.concatenate([ids[:10], a, b]))) == 40
@@ -98,7 +98,7 @@ def test_memory_stays_flat_when_young_points_come_and_go():
     sparse_map = new_map()
     for k in range(60):
         sparse_map.add_points(*random_points(500, seed=k))
-        sparse_map.cull_points(NOTHING)
+        sparse_map.cull_points(NOTHING, NOTHING)
     assert len(sparse_map.alive) < 10000
     assert sparse_map.alive.sum() == 0
 
@@ -124,16 +124,18 @@ def test_points_rarely_found_where_visible_are_culled():
     often, rarely, new = ids[:20], ids[20:40], ids[40:]
     see(sparse_map, ids[:40], often, 20)
     see(sparse_map, new, NOTHING, 3)  # too few chances to judge
-    sparse_map.cull_points(NOTHING)
+    sparse_map.cull_points(NOTHING, ids)
     assert sparse_map.alive[often].all() and sparse_map.alive[new].all()
     assert not sparse_map.alive[rarely].any()
+    fresh = sparse_map.add_points(*random_points(60, seed=1))
+    assert not np.isin(fresh, ids).any()  # the keyframe still names the dead ones
 
 
 def test_a_tracked_point_is_not_culled():
     sparse_map = new_map()
     ids = sparse_map.add_points(*random_points(20))
     see(sparse_map, ids, NOTHING, 50)
-    sparse_map.cull_points(ids[:5])
+    sparse_map.cull_points(ids[:5], ids)
     assert sparse_map.alive[ids].tolist() == [True] * 5 + [False] * 15
 
 
@@ -143,7 +145,7 @@ def test_points_that_are_no_numbers_are_culled_always():
     sparse_map.add_keyframe(keyframe_of(ids))
     sparse_map.position_m[ids[0], 1] = np.nan
     sparse_map.position_m[ids[1], 2] = np.inf
-    sparse_map.cull_points(ids)
+    sparse_map.cull_points(ids, NOTHING)
     assert sparse_map.alive[ids].tolist() == [False, False] + [True] * 4
 
 
@@ -185,7 +187,7 @@ def test_local_points_are_in_view_alive_and_not_tracked():
     points[40:60, 0] += 60  # beside the picture
     ids = sparse_map.add_points(points, *rest)
     sparse_map.add_keyframe(keyframe_of(ids[:280]))
-    sparse_map.cull_points(ids[:270])  # the last twenty were never in a keyframe
+    sparse_map.cull_points(ids[:270], NOTHING)  # the last twenty were never in a keyframe
     tracked = ids[100:150]
     found, uv = sparse_map.local_points(np.eye(4), tracked)
     np.testing.assert_array_equal(np.sort(found), np.r_[ids[60:100], ids[150:280]])
@@ -243,9 +245,21 @@ def test_a_new_disparity_offset_moves_points_along_their_slopes():
     ids = sparse_map.add_points(*random_points(20))
     before = sparse_map.position_m[ids].copy()
     slopes = sparse_map.offset_slope[ids].copy()
-    sparse_map.shift_offset(np.eye(4), np.zeros(6), 0.2)
-    np.testing.assert_allclose(sparse_map.position_m[ids], before + 0.2 * slopes)
+    sparse_map.shift_offset(ids[:15], np.eye(4), np.zeros(6), 0.2)
+    moved = before + 0.2 * slopes
+    moved[15:] = before[15:]
+    np.testing.assert_allclose(sparse_map.position_m[ids], moved)
     np.testing.assert_array_equal(sparse_map.offset_slope[ids], slopes)
+
+
+def test_slopes_follow_the_camera_that_is_held_still():
+    """A camera that depends on the offset by a shift v hands it to the points, the other way."""
+    sparse_map = new_map()
+    ids = sparse_map.add_points(*random_points(20))
+    slopes = sparse_map.offset_slope[ids].copy()
+    shift = np.array([0.3, -0.2, 0.5])
+    sparse_map.shift_offset(ids, np.eye(4), np.r_[0.0, 0.0, 0.0, shift], 0.0)
+    np.testing.assert_allclose(sparse_map.offset_slope[ids], slopes - shift)
 
 
 def snapshot_scene():

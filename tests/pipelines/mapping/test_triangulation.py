@@ -120,6 +120,15 @@ def test_points_behind_a_camera_are_refused():
     assert check(crossed, features_at(uv_b), features_at(uv_a)).mean() < 0.2
 
 
+def test_a_point_passed_on_the_optical_axis_is_refused():
+    """Its pixel is the centre before and behind: only the sign of its depth tells."""
+    point = transform_points(T_A, np.array([[0.0, 0.0, 5.0]]))
+    centre = features_at(np.array([[CAMERA.cx, CAMERA.cy]]))
+    beyond = T_A @ make_T(np.eye(3), np.array([0.0, 0.0, 9.0]))
+    assert not check(point, centre, centre, T_b=beyond).any()
+    assert not check(point, centre, centre, T_a=beyond, T_b=T_A).any()
+
+
 @pytest.mark.parametrize(
     ("octave_a", "octave_b", "passes"), [(0, 0, True), (2, 0, True), (0, 6, False), (6, 0, False)]
 )

@@ -19,6 +19,7 @@ from pipelines.datasets.sequence import Sequence
 from pipelines.dyob_slam import DyObSlam
 from pipelines.errors import DatasetError, FrameError
 from pipelines.evaluation import evaluate_result
+from pipelines.io.folder import clear_result_folder
 from pipelines.io.result import (
     Result,
     ResultWriter,
@@ -71,6 +72,7 @@ def run(
     config = config or Config()
     indices = _chosen_frames(len(sequence), start, frames, stride)
     folder = create_result_folder(RESULTS, sequence.name) if output is None else Path(output)
+    clear_result_folder(folder)
     writer = ResultWriter(folder)
     writer.write_config(config_to_dict(config))
     slam = DyObSlam(sequence.camera, config)
@@ -83,10 +85,11 @@ def run(
         try:
             _process_all(sequence, slam, indices, stride, sinks, progress)
         except KeyboardInterrupt:
-            progress.interrupted = True
-            _log.warning(
-                "interrupted after %d frames: the result holds these", len(progress.results)
-            )
+            _note_interruption(progress)
+        except Exception:
+            if progress.results:  # what was done is worth keeping, whatever went wrong
+                _write(writer, sequence, slam, progress)
+            raise
         finally:
             for sink in sinks:
                 sink.finish()
@@ -95,9 +98,17 @@ def run(
                 f"{sequence.name}: expected frames that can be read, found none among "
                 f"{len(indices)}; see {folder / 'run.log'} for each one's reason"
             )
-        _write(writer, sequence, slam, progress)
-    evaluate_result(folder)
+        try:
+            _write(writer, sequence, slam, progress)
+        except KeyboardInterrupt:  # once more, in peace; a second Ctrl-C ends it
+            _note_interruption(progress)
+            _write(writer, sequence, slam, progress)
     return load_result(folder)
+
+
+def _note_interruption(progress: _Progress) -> None:
+    progress.interrupted = True
+    _log.warning("interrupted after %d frames: the result holds these", len(progress.results))
 
 
 def _chosen_frames(n_frames: int, start: int, frames: int | None, stride: int) -> range:
@@ -169,9 +180,9 @@ def _check_size(sequence: Sequence, frame: Frame) -> None:
 
 
 def _write(writer: ResultWriter, sequence: Sequence, slam: DyObSlam, progress: _Progress) -> None:
-    """All files but the metrics' errors, which the evaluator adds from the folder."""
+    """All files: first what was estimated; the truth, which may be damaged, costs only errors."""
     static_map = slam.static_map()
-    writer.write_run(progress.results, static_map, sequence.ground_truth())
+    writer.write_run(progress.results, static_map)
     metrics = {
         "run": run_metrics(
             progress.results,
@@ -183,3 +194,10 @@ def _write(writer: ResultWriter, sequence: Sequence, slam: DyObSlam, progress: _
         )
     }
     writer.write_metrics(metrics, "")
+    try:
+        truth = sequence.ground_truth()
+        if truth is not None:
+            writer.write_ground_truth(progress.results, truth)
+    except DatasetError as error:
+        _log.warning("no errors can be computed, the ground truth cannot be read: %s", error)
+    evaluate_result(writer.folder)
