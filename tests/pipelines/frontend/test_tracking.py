@@ -178,14 +178,14 @@ def test_a_wrong_prediction_loses_to_the_points():
     """The camera is said to look 15 px aside: too far for alignment, not for ORB and PnP."""
     run = Run(use_rgbd_odometry=False).begin(path(0))
     for k in (1, 2):
-        run.track(path(k), k)
+        before = run.track(path(k), k)
     aside = path(2) @ exp_se3(np.array([0.0, -0.06, 0.0, 0.0, 0.0, 0.0]))
     run.tracker.start(run.view(path(2), 2), aside)
     run.map.keyframes.clear()  # nothing to relocalise against
     tracked = run.tracker.track(run.view(path(3), 3), run.map)
     assert tracked.status is TrackingStatus.OK
     assert tracked.hypothesis is MotionHypothesis.PNP_RANSAC
-    assert tracked.inliers.sum() > 150
+    assert tracked.inliers.sum() > 0.85 * before.inliers.sum()
     assert error_m_deg(tracked.T_world_camera, path(3))[0] < 0.01
 
 
