@@ -1,0 +1,165 @@
+"""Where known points are in a view: those of the last frame, and those of the local map.
+
+Owns the search for points by flow, by ORB descriptors and by patch alignment. Estimates no pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pipelines.config import TrackingConfig
+from pipelines.frontend.alignment import align_patches, fuse_measurements
+from pipelines.frontend.matching import match_in_radius
+from pipelines.frontend.sampling import sample_bilinear
+from pipelines.frontend.sensor import Sensor
+from pipelines.frontend.view import View
+from pipelines.geometry import MIN_DEPTH_M, invert_T, project_stereo, transform_points
+from pipelines.mapping.keyframe import Tracks
+from pipelines.mapping.sparse_map import SparseMap
+from pipelines.types import Array
+
+_ALIGNMENT_TOLERANCE_PX = 10.0  # alignment may move a point this far from an ORB match
+_TAKEN_PX = 3.0  # a feature this near a tracked point is that point
+_NEIGHBOURS = 5  # matched points that predict the place of an unmatched one
+
+
+@dataclass(frozen=True, slots=True)
+class LastFrame:
+    """What the next frame is tracked from.
+
+    tracks: the points seen in `view`. flow_starts_here: whether the next frame's flow begins at it.
+    """
+
+    view: View
+    tracks: Tracks
+    flow_starts_here: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """Where the last frame's points are now, with each source's own say for learning its noise.
+
+    sources_px: name of the source -> (N, 2) places, NaN where it had nothing to say.
+    """
+
+    tracks: Tracks
+    sources_px: dict[str, Array]
+
+
+def measure_points(
+    last: LastFrame,
+    view: View,
+    sparse_map: SparseMap,
+    T_world_camera: Array,
+    sensor: Sensor,
+    config: TrackingConfig,
+) -> Measurement:
+    """Where the points of the last frame are in this view.
+
+    The start is the given flow where there is one, else ORB matches around the places that the
+    predicted `T_world_camera` (4, 4) says. Patch alignment makes it sub-pixel, and is fused with
+    the flow by their learned noise.
+    """
+    flow_uv = _places_by_flow(last, view)
+    start = _places_to_start(last, view, sparse_map, T_world_camera, flow_uv, config)
+    by_flow = np.asarray(np.isfinite(flow_uv).all(axis=1))
+    tolerance = config.flow_tolerance_px if by_flow.any() else _ALIGNMENT_TOLERANCE_PX
+    tracks = last.tracks
+    aligned, ok = align_patches(last.view.gray, view.gray, tracks.uv_px, start, tolerance)
+    sigma = sensor.noise.sigma_uv_px
+    uv, valid, sigma_px = fuse_measurements(
+        flow_uv, by_flow, sigma["flow"], aligned, ok, sigma["alignment"]
+    )
+    aligned[~ok] = np.nan
+    valid &= view.is_static(uv) & np.isfinite(uv).all(axis=1)
+    uv = uv[valid]
+    return Measurement(
+        Tracks(tracks.point_ids[valid], uv, sensor.read_close_disparity(view, uv), sigma_px[valid]),
+        {"flow": flow_uv[valid], "alignment": aligned[valid]},
+    )
+
+
+def _places_by_flow(last: LastFrame, view: View) -> Array:
+    """Places (N, 2) that the given flow says, NaN where there is none."""
+    uv = last.tracks.uv_px
+    if view.flow_prev_to_curr_px is None or not last.flow_starts_here or len(uv) == 0:
+        return np.full((len(uv), 2), np.nan)
+    return uv + sample_bilinear(view.flow_prev_to_curr_px, uv)
+
+
+def _places_to_start(
+    last: LastFrame,
+    view: View,
+    sparse_map: SparseMap,
+    T_world_camera: Array,
+    flow_uv: Array,
+    config: TrackingConfig,
+) -> Array:
+    """Start (N, 2) of the alignment: flow, else ORB matches, else as matched neighbours go."""
+    start = flow_uv.copy()
+    missing = np.flatnonzero(~np.isfinite(flow_uv).all(axis=1))
+    if len(missing) == 0:
+        return start
+    ids = last.tracks.point_ids[missing]
+    points = transform_points(invert_T(T_world_camera), sparse_map.position_m[ids])
+    front = points[:, 2] > MIN_DEPTH_M
+    missing, ids, points = missing[front], ids[front], points[front]
+    predicted = project_stereo(sparse_map.camera, points)[:, :2]
+    start[missing] = predicted
+    matched, features = match_in_radius(
+        predicted,
+        sparse_map.descriptor[ids],
+        view.features.uv_px,
+        view.features.descriptors,
+        config.search_radius_px,
+        config.max_hamming,
+    )
+    if len(matched) < 2 * _NEIGHBOURS:
+        return start
+    shift = view.features.uv_px[features] - predicted[matched]
+    unmatched = np.setdiff1d(np.arange(len(missing)), matched)
+    if len(unmatched):
+        _, nearest = cKDTree(predicted[matched]).query(predicted[unmatched], k=_NEIGHBOURS)
+        start[missing[unmatched]] += np.median(shift[nearest], axis=1)
+    start[missing[matched]] += shift
+    return start
+
+
+def search_local_map(
+    view: View,
+    sparse_map: SparseMap,
+    tracks: Tracks,
+    T_world_camera: Array,
+    sensor: Sensor,
+    config: TrackingConfig,
+) -> tuple[Tracks, NDArray[np.int64]]:
+    """Points of the local map found again in this view, and the ids of all that were in view.
+
+    tracks: points already measured, which are not searched for, nor are their features taken.
+    """
+    ids, predicted = sparse_map.local_points(T_world_camera, tracks.point_ids)
+    on_static = view.is_static(predicted)
+    ids, predicted = ids[on_static], predicted[on_static]
+    features = view.features
+    if len(ids) == 0 or len(features) == 0:
+        return Tracks.empty(), ids
+    taken = np.zeros(len(features), bool)
+    if len(tracks):
+        distance, _ = cKDTree(tracks.uv_px).query(features.uv_px, distance_upper_bound=_TAKEN_PX)
+        taken = np.isfinite(distance)
+    free = np.flatnonzero(~taken)
+    matched, chosen = match_in_radius(
+        predicted,
+        sparse_map.descriptor[ids],
+        features.uv_px[free],
+        features.descriptors[free],
+        config.map_radius_px,
+        config.max_hamming,
+    )
+    uv = features.uv_px[free[chosen]]
+    sigma = np.full(len(uv), sensor.noise.sigma_uv_px["orb"])
+    return Tracks(ids[matched], uv, sensor.read_close_disparity(view, uv), sigma), ids
