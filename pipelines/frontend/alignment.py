@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipelines.types import Array, Image
 
-_WINDOW_PX = 15  # side of the aligned patch
+_WINDOW_PX = 17  # side of the aligned patch
 _PYRAMID_LEVELS = 1  # one coarser level: the predictions are good to some pixels
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.005)
 

@@ -65,7 +65,7 @@ def _first_per_group(group: Indices, distance: NDArray[np.int64]) -> NDArray[np.
 def match_all(
     descriptors_a: Descriptors, descriptors_b: Descriptors, max_distance: int, ratio: float
 ) -> tuple[Indices, Indices]:
-    """Mutual nearest matches of all with all, where the second best is clearly worse (Lowe)."""
+    """One-to-one nearest matches of all with all, where the second best is clearly worse (Lowe)."""
     none = np.empty(0, np.int64)
     if len(descriptors_a) < 2 or len(descriptors_b) < 2:
         return none, none

@@ -25,7 +25,6 @@ _CHI2_MEDIAN_2DOF, _CHI2_MEDIAN_3DOF = 1.386, 2.366
 _NOISY = 3.0  # times the expected median of chi-square
 _MAX_NOISE_FACTOR = 2.0  # a frame may be this much noisier than the ones before
 _MIN_POINTS = 6  # fewer cannot be told from an accident
-_ROBUST_ROUNDS = 2  # solve with Huber's kernel, reject by chi-square, solve again
 _MAX_ITERATIONS = 10  # Levenberg-Marquardt steps per round
 _CONVERGED_SIGMAS = 0.01  # a step this small beside the pose's standard deviation ends a round
 
@@ -80,18 +79,21 @@ class PoseEstimate:
 
 
 def estimate_camera_pose(
-    camera: StereoCamera, T_world_camera: Array, observations: StereoObservations
+    camera: StereoCamera,
+    T_world_camera: Array,
+    observations: StereoObservations,
+    robust_rounds: int = 2,
 ) -> PoseEstimate:
     """Camera pose that minimises the reprojection error, eq. (1), from an initial guess.
 
-    Huber's kernel on Mahalanobis distances, then chi-square rejection (95 %), twice, and a last
-    solution of the inliers alone. The weight of an observation is the inverse of its pixel noise
-    plus its point's uncertainty seen in the image, which eliminates the points exactly to first
-    order.
+    Huber's kernel on Mahalanobis distances, then chi-square rejection (95 %), `robust_rounds` times
+    (one will do from a good guess), and a last solution of the inliers alone. The weight of an
+    observation is the inverse of its pixel noise plus its point's uncertainty seen in the image,
+    which eliminates the points exactly to first order.
     """
     used = np.ones(len(observations), bool)
     T = T_world_camera
-    for _ in range(_ROBUST_ROUNDS):
+    for _ in range(robust_rounds):
         problem = _Problem(camera, T, observations)
         T = problem.minimise(T, used, robust=True)
         problem.allow_for_noise(T)
@@ -127,15 +129,19 @@ def observation_covariance(
 
 
 def whitening(covariances: Array) -> Array:
-    """Lower triangular W (N, 3, 3) with W S W^T = I, by Cholesky in closed form."""
+    """Lower triangular W (N, 3, 3) with W S W^T = I, by Cholesky in closed form.
+
+    Not finite where S is not positive definite in double precision.
+    """
     S = covariances
     W = np.zeros_like(S)
-    g00 = np.sqrt(S[:, 0, 0])
-    g10, g20 = S[:, 1, 0] / g00, S[:, 2, 0] / g00
-    g11 = np.sqrt(S[:, 1, 1] - g10**2)
-    g21 = (S[:, 2, 1] - g20 * g10) / g11
-    g22 = np.sqrt(S[:, 2, 2] - g20**2 - g21**2)
-    W[:, 0, 0], W[:, 1, 1], W[:, 2, 2] = 1.0 / g00, 1.0 / g11, 1.0 / g22
+    with np.errstate(invalid="ignore", divide="ignore"):
+        g00 = np.sqrt(S[:, 0, 0])
+        g10, g20 = S[:, 1, 0] / g00, S[:, 2, 0] / g00
+        g11 = np.sqrt(S[:, 1, 1] - g10**2)
+        g21 = (S[:, 2, 1] - g20 * g10) / g11
+        g22 = np.sqrt(S[:, 2, 2] - g20**2 - g21**2)
+        W[:, 0, 0], W[:, 1, 1], W[:, 2, 2] = 1.0 / g00, 1.0 / g11, 1.0 / g22
     W[:, 1, 0] = -g10 * W[:, 0, 0] * W[:, 1, 1]
     W[:, 2, 1] = -g21 * W[:, 1, 1] * W[:, 2, 2]
     W[:, 2, 0] = -(g20 * W[:, 0, 0] + g21 * W[:, 1, 0]) * W[:, 2, 2]
@@ -157,6 +163,8 @@ class _Problem:
         self.limit = np.where(self.mono, CHI2_95_2DOF, CHI2_95_3DOF)
         W = whitening(observation_covariance(camera, T, observations))
         W[self.mono, 2] = 0.0  # the first two rows do not know of the third
+        self.usable = self._in_camera(T)[3] & np.isfinite(W).all(axis=(1, 2))
+        W[~self.usable] = 0.0  # nothing is known of a projection from behind
         self.W = W.transpose(1, 2, 0).copy()
 
     def allow_for_noise(self, T: Array) -> None:
@@ -164,6 +172,8 @@ class _Problem:
 
         The median of chi-square says by how much; it may at most double the standard deviations.
         """
+        if len(self.mono) == 0:
+            return
         expected = np.where(self.mono, _CHI2_MEDIAN_2DOF, _CHI2_MEDIAN_3DOF)
         excess = float(np.median(self.chi2(T) / expected))
         if excess > _NOISY:
@@ -192,10 +202,10 @@ class _Problem:
         return np.stack(self._residual_rows(*self._in_camera(T)[:3]), -1)
 
     def chi2(self, T: Array) -> Array:
-        """(N,) squared Mahalanobis distances, inf behind the camera."""
+        """(N,) squared Mahalanobis distances, inf behind the camera (now or when whitened)."""
         x, y, inverse_z, visible = self._in_camera(T)
         e0, e1, e2 = self._whiten(*self._residual_rows(x, y, inverse_z))
-        return np.where(visible, e0 * e0 + e1 * e1 + e2 * e2, np.inf)
+        return np.where(visible & self.usable, e0 * e0 + e1 * e1 + e2 * e2, np.inf)
 
     def cost(self, T: Array, used: NDArray[np.bool_], robust: bool) -> float:
         """Half the (Huber) cost of the used observations; one behind the camera costs a lot."""
@@ -213,7 +223,7 @@ class _Problem:
         x, y, inverse_z, visible = self._in_camera(T)
         z = 1.0 / inverse_z
         e = self._whiten(*self._residual_rows(x, y, inverse_z))
-        weight = (used & visible).astype(float)
+        weight = (used & visible & self.usable).astype(float)
         if robust:
             chi2 = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
             weight *= np.minimum(1.0, np.sqrt(self.limit / np.maximum(chi2, 1e-12)))

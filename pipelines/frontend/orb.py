@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipelines.config import OrbConfig
 from pipelines.types import Array, Features, Image
 
-_OVERSAMPLING = 2.0  # corners detected per feature kept, so that spreading has a choice
+_OVERSAMPLING = 3  # corners detected per feature kept, so that spreading has a choice
 
 
 class OrbExtractor:
@@ -24,7 +24,7 @@ class OrbExtractor:
     def __init__(self, config: OrbConfig) -> None:
         self.config = config
         self._orb = cv2.ORB_create(
-            nfeatures=int(config.n_features * _OVERSAMPLING),
+            nfeatures=config.n_features * _OVERSAMPLING,
             scaleFactor=config.scale_factor,
             nlevels=config.n_levels,
             fastThreshold=config.fast_threshold,
@@ -37,13 +37,17 @@ class OrbExtractor:
 
         Depths are left unknown (NaN). At most `n_features`, the strongest of each image cell.
         """
-        mask = None if static is None else static.view(np.uint8) * np.uint8(255)
-        keypoints = self._orb.detect(gray, mask)
-        if not keypoints:
+        corners = self._orb.detect(gray, None)  # masking afterwards is faster
+        if not corners:
             return Features.empty()
-        table = np.array([(*k.pt, k.response, k.octave) for k in keypoints])
-        kept = spread_evenly(table[:, :2], table[:, 2], gray.shape[:2], self.config.n_features)
-        keypoints, descriptors = self._orb.compute(gray, [keypoints[i] for i in kept])
+        uv = cv2.KeyPoint_convert(corners).astype(np.float64)
+        candidates = np.arange(len(corners))
+        if static is not None:
+            column, row = np.rint(uv).astype(np.int64).T
+            candidates = np.flatnonzero(static[row, column])
+        response = np.array([corner.response for corner in corners])[candidates]
+        kept = spread_evenly(uv[candidates], response, gray.shape[:2], self.config.n_features)
+        keypoints, descriptors = self._orb.compute(gray, [corners[i] for i in candidates[kept]])
         if descriptors is None or not keypoints:
             return Features.empty()
         table = np.array([(*k.pt, k.octave, k.angle, k.response) for k in keypoints])

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from pipelines.types import Array, Image, StereoCamera
 
-_ITERATIONS = (10, 5, 3)  # per pyramid level, coarse to fine
+_ITERATIONS = (20, 10, 5)  # per pyramid level, coarse to fine
 _MIN_VALID_PIXELS = 2000  # fewer pixels with depth cannot fix a pose
-_MAX_DISPARITY_JUMP = 0.07  # depths that differ by more than this share of z do not correspond
+_MAX_DEPTH_JUMP = 0.05  # depths that differ by more, as a share of the median, do not correspond
 
 
 def estimate_rgbd_odometry(
@@ -49,7 +49,7 @@ def estimate_rgbd_odometry(
             max_depth_m,
             [odometry.OdometryConvergenceCriteria(n) for n in _ITERATIONS],
             odometry.Method.PointToPlane,
-            odometry.OdometryLossParams(_MAX_DISPARITY_JUMP * max_depth_m),
+            odometry.OdometryLossParams(_MAX_DEPTH_JUMP * float(np.nanmedian(current[1]))),
         )
     except RuntimeError:  # a singular system: too little structure in common
         return None

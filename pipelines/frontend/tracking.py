@@ -108,7 +108,7 @@ class Tracker:
             found, visible = search_local_map(view, sparse_map, tracks, T, self.sensor, self.config)
             if len(found):
                 tracks = Tracks.concatenate(tracks, found)
-                estimate = self._adjust(sparse_map, tracks, T)
+                estimate = self._adjust(sparse_map, tracks, T, robust_rounds=1)
                 self._learn_orb_noise(estimate, len(measured.tracks))
         pixels = estimate.residuals_px[estimate.inliers][:, :2]
         return TrackedFrame(
@@ -134,9 +134,11 @@ class Tracker:
             np.empty(0, np.int64),
         )
 
-    def _adjust(self, sparse_map: SparseMap, tracks: Tracks, T: Array) -> PoseEstimate:
+    def _adjust(
+        self, sparse_map: SparseMap, tracks: Tracks, T: Array, robust_rounds: int = 2
+    ) -> PoseEstimate:
         observations = sparse_map.observe(tracks, self.noise.sigma_disparity_px)
-        return estimate_camera_pose(self.camera, T, observations)
+        return estimate_camera_pose(self.camera, T, observations, robust_rounds)
 
     # ------------------------------------------------------------ hypotheses
 

@@ -50,7 +50,7 @@ class View:
         """(H, W) float32 depth, NaN where unknown or on movable objects."""
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.float32(camera.bf) / self.disparity_px
-        return np.where(self.static, depth, np.float32(np.nan))
+        return np.where(self.static & (self.disparity_px > 0), depth, np.float32(np.nan))
 
 
 def to_gray(image: Image) -> Image:

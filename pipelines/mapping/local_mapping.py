@@ -36,6 +36,7 @@ class LocalMapping:
     def __init__(self, sensor: Sensor, config: Config) -> None:
         self.sensor, self.config = sensor, config
         self.camera = sensor.camera
+        self._calibrates = config.tracking.calibrate_disparity and not sensor.camera.is_rgbd
 
     def integrate(
         self, sparse_map: SparseMap, view: View, tracked: TrackedFrame
@@ -47,7 +48,8 @@ class LocalMapping:
         tracks = tracked.tracks[tracked.inliers]
         visible = np.union1d(tracked.visible_ids, tracked.tracks.point_ids)
         sparse_map.record_sight(visible, tracks.point_ids)
-        self._refine(sparse_map, tracked, tracks, visible)
+        self._learn_offset(sparse_map, tracked, tracks, visible)
+        self._refine(sparse_map, tracked, tracks)
         free = self.mappable_features(view, tracks)
         budget = max(0, self.config.orb.n_features - len(tracks))
         new = self._add_points(sparse_map, view, tracked.T_world_camera, free[:budget])
@@ -56,6 +58,9 @@ class LocalMapping:
         is_keyframe = needs_keyframe(self.config.mapping, tracks, last, view.frame_index)
         if is_keyframe:
             tracks = self._add_keyframe(sparse_map, view, tracked, tracks)
+        if self._calibrates:  # from the next view on: this one's disparities have the old offset
+            step_px = self.sensor.offset.step()
+            sparse_map.shift_offset(np.union1d(visible, tracks.point_ids), step_px)
         sparse_map.cull_points(tracks.point_ids, visible)
         return tracks[sparse_map.alive[tracks.point_ids]], is_keyframe
 
@@ -76,24 +81,26 @@ class LocalMapping:
         distance, _ = cKDTree(occupied_px).query(uv_px, distance_upper_bound=apart)
         return ~np.isfinite(distance)
 
-    def _refine(
+    def _learn_offset(
         self,
         sparse_map: SparseMap,
         tracked: TrackedFrame,
         tracks: Tracks,
         visible: NDArray[np.int64],
     ) -> None:
+        if not self._calibrates or len(tracks) == 0:
+            return
+        T = tracked.T_world_camera
+        observations = sparse_map.observe(tracks, self.sensor.noise.sigma_disparity_px)
+        slopes = sparse_map.offset_slope[tracks.point_ids]
+        pose_slope = self.sensor.offset.learn(self.camera, T, observations, slopes)
+        sparse_map.hold_camera(visible, T, pose_slope)
+
+    def _refine(self, sparse_map: SparseMap, tracked: TrackedFrame, tracks: Tracks) -> None:
         if len(tracks) == 0:
             return
         ids, T = tracks.point_ids, tracked.T_world_camera
-        sigma = self.sensor.noise.sigma_disparity_px
-        observations = sparse_map.observe(tracks, sigma)
-        if self.config.tracking.calibrate_disparity and not self.camera.is_rgbd:
-            pose_slope = self.sensor.offset.learn(
-                self.camera, T, observations, sparse_map.offset_slope[ids]
-            )
-            sparse_map.shift_offset(visible, T, pose_slope, self.sensor.offset.step())
-            observations = sparse_map.observe(tracks, sigma)
+        observations = sparse_map.observe(tracks, self.sensor.noise.sigma_disparity_px)
         points, covariances, slopes = refine_points(
             self.camera, T, tracked.covariance, observations, sparse_map.offset_slope[ids]
         )

@@ -54,6 +54,7 @@ class SparseMap:
         self.camera, self.config = camera, config
         self.keyframes: list[Keyframe] = []
         self._covisible: list[Ids] = []  # per keyframe, its covisible ones, most shared first
+        self._n_shared: list[Ids] = []  # with each of them
         self._size = 0
         self._free = np.empty(0, np.int64)
         self._young = np.empty(0, np.int64)  # points that no keyframe has seen yet
@@ -111,14 +112,13 @@ class SparseMap:
             np.full(len(ids), sigma_disparity_px),
         )
 
-    def shift_offset(
-        self, ids: Ids, T_world_camera: Array, pose_slope: Array, step_px: float
-    ) -> None:
-        """Let points follow a new disparity offset, with the present camera held still."""
-        slope = self.offset_slope[ids]
-        slope += follow_camera(T_world_camera, self.position_m[ids], pose_slope)
-        self.offset_slope[ids] = slope
-        self.position_m[ids] += step_px * slope
+    def hold_camera(self, ids: Ids, T_world_camera: Array, pose_slope: Array) -> None:
+        """Let points depend on the disparity offset as seen with the present camera held still."""
+        self.offset_slope[ids] += follow_camera(T_world_camera, self.position_m[ids], pose_slope)
+
+    def shift_offset(self, ids: Ids, step_px: float) -> None:
+        """Let points follow a new disparity offset."""
+        self.position_m[ids] += step_px * self.offset_slope[ids]
 
     def record_sight(self, visible_ids: Ids, found_ids: Ids) -> None:
         """Count which points a frame should have seen, and which it did see."""
@@ -156,9 +156,13 @@ class SparseMap:
         for other in self.local_keyframes(ids, keyframe.T_world_camera):
             shared[other] = flags[self.keyframes[other].tracks.point_ids].sum()
         covisible = np.flatnonzero(shared >= self.config.min_shared_points)
-        self._covisible.append(covisible[np.argsort(-shared[covisible], kind="stable")])
+        covisible = covisible[np.argsort(-shared[covisible], kind="stable")]
+        self._covisible.append(covisible)
+        self._n_shared.append(shared[covisible])
         for other in covisible:
-            self._covisible[other] = np.append(self._covisible[other], index)
+            place = np.searchsorted(-self._n_shared[other], -shared[other], side="right")
+            self._covisible[other] = np.insert(self._covisible[other], place, index)
+            self._n_shared[other] = np.insert(self._n_shared[other], place, shared[other])
         self.first_keyframe[new] = index
         self.n_keyframes[ids] += 1
         self.keyframes.append(keyframe)

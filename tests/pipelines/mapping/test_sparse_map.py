@@ -245,7 +245,7 @@ def test_a_new_disparity_offset_moves_points_along_their_slopes():
     ids = sparse_map.add_points(*random_points(20))
     before = sparse_map.position_m[ids].copy()
     slopes = sparse_map.offset_slope[ids].copy()
-    sparse_map.shift_offset(ids[:15], np.eye(4), np.zeros(6), 0.2)
+    sparse_map.shift_offset(ids[:15], 0.2)
     moved = before + 0.2 * slopes
     moved[15:] = before[15:]
     np.testing.assert_allclose(sparse_map.position_m[ids], moved)
@@ -258,7 +258,7 @@ def test_slopes_follow_the_camera_that_is_held_still():
     ids = sparse_map.add_points(*random_points(20))
     slopes = sparse_map.offset_slope[ids].copy()
     shift = np.array([0.3, -0.2, 0.5])
-    sparse_map.shift_offset(ids, np.eye(4), np.r_[0.0, 0.0, 0.0, shift], 0.0)
+    sparse_map.hold_camera(ids, np.eye(4), np.r_[0.0, 0.0, 0.0, shift])
     np.testing.assert_allclose(sparse_map.offset_slope[ids], slopes - shift)
 
 
