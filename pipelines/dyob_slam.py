@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from pipelines.depth import StereoDepth
 from pipelines.frontend.orb import OrbExtractor
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame, Tracker
-from pipelines.frontend.view import View, make_view
+from pipelines.frontend.view import PreparedFrame, View, complete_view, prepare_frame
 from pipelines.mapping.keyframe import Tracks
 from pipelines.mapping.local_mapping import LocalMapping
 from pipelines.mapping.sparse_map import SparseMap
@@ -52,22 +53,39 @@ class DyObSlam:
         self._lost_frames = 0
         self._timings_ms: dict[str, float] = {}
 
-    def process(self, frame: Frame) -> FrameResult:
-        """Track one frame and grow the map. Frames must come in order of time."""
-        self._timings_ms = {}
-        with self._stage("total"):
-            # 0. Depth, given or by stereo
-            with self._stage("depth"):
-                depth_m = self._depth(frame)
-            # 1 and 3. Movable objects are masked; ORB features on the static part
-            with self._stage("features"):
-                view = self._see(frame, depth_m)
-            # 4. Camera pose
-            tracked = self._track(view)
-            # 10. Sparse map
-            with self._stage("mapping"):
-                is_keyframe = self._grow_map(view, tracked)
-        return self._result(frame, tracked, is_keyframe)
+    def process(self, frame: Frame | PreparedFrame) -> FrameResult:
+        """Track one frame and grow the map. Frames must come in order of time.
+
+        A frame that `prepare` has had before, in another thread say, is not prepared again.
+        """
+        prepared = self.prepare(frame) if isinstance(frame, Frame) else frame
+        self._timings_ms = dict(prepared.timings_ms)
+        # What is known of the sensor by now completes the view
+        with self._stage("view"):
+            sigma, offset = self.sensor.noise.sigma_disparity_px, self.sensor.offset.offset_px
+            view = complete_view(self.camera, prepared, sigma, offset)
+        # 4. Camera pose
+        tracked = self._track(view)
+        # 10. Sparse map
+        with self._stage("mapping"):
+            is_keyframe = self._grow_map(view, tracked)
+        self._timings_ms["total"] = sum(self._timings_ms.values())
+        return self._result(prepared.frame, tracked, is_keyframe)
+
+    def prepare(self, frame: Frame) -> PreparedFrame:
+        """The part of a frame's work that depends on no other frame; it may run ahead of `process`.
+
+        Frames may be prepared in one thread while another processes; the answers are the same.
+        """
+        begin = time.perf_counter()
+        # 0. Depth, given or by stereo
+        depth_m = self._depth(frame)
+        middle = time.perf_counter()
+        # 1 and 3. Movable objects are masked; ORB features on the static part
+        prepared = prepare_frame(self.camera, frame, depth_m, self._orb)
+        end = time.perf_counter()
+        timings_ms = {"depth": 1e3 * (middle - begin), "features": 1e3 * (end - middle)}
+        return replace(prepared, timings_ms=timings_ms)
 
     def static_map(self) -> StaticMap:
         """The sparse static map as it stands, copied."""
@@ -81,10 +99,6 @@ class DyObSlam:
         if self._stereo is None:
             self._stereo = StereoDepth(self.config.depth, self.camera)
         return self._stereo.compute(frame.image, frame.image_right)
-
-    def _see(self, frame: Frame, depth_m: NDArray[np.float32] | None) -> View:
-        sigma, offset = self.sensor.noise.sigma_disparity_px, self.sensor.offset.offset_px
-        return make_view(self.camera, frame, depth_m, self._orb, sigma, offset)
 
     def _track(self, view: View) -> TrackedFrame:
         if self._tracker.motion is None:

@@ -6,11 +6,11 @@ a person interrupts. Ground truth is opened here only after the last frame is do
 
 from __future__ import annotations
 
-import dataclasses
 import logging
+import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -19,6 +19,7 @@ from pipelines.datasets.sequence import Sequence
 from pipelines.dyob_slam import DyObSlam
 from pipelines.errors import DatasetError, FrameError
 from pipelines.evaluation import evaluate_result
+from pipelines.frontend.view import PreparedFrame
 from pipelines.io.folder import clear_result_folder
 from pipelines.io.result import (
     Result,
@@ -131,18 +132,22 @@ def _process_all(
     progress: _Progress,
 ) -> None:
     previous: int | None = None
-    for index, pending in _read_ahead(sequence, indices):
+    begin = time.perf_counter()
+    for index, pending in _prepare_ahead(sequence, slam, indices):
         try:
-            frame = pending.result()
-            _check_size(sequence, frame)
+            prepared = pending.result()
         except FrameError as error:
             progress.skipped += 1
             _log.warning("frame %d skipped: %s", index, error)
             continue
         if stride != 1 or previous != index - 1:  # the flow starts at a frame that was not seen
-            frame = dataclasses.replace(frame, flow_prev_to_curr_px=None)
+            frame = replace(prepared.frame, flow_prev_to_curr_px=None)
+            prepared = replace(prepared, frame=frame)
         previous = index
-        result = slam.process(frame)
+        result = slam.process(prepared)
+        end = time.perf_counter()
+        result.timings_ms["wall"] = 1e3 * (end - begin)
+        begin = end
         progress.results.append(result)
         _log.info(
             "frame %d %s by %s, %d inliers of %d%s, %.1f ms",
@@ -152,20 +157,28 @@ def _process_all(
             int(result.inliers.sum()),
             len(result.inliers),
             ", keyframe" if result.is_keyframe else "",
-            result.timings_ms["total"],
+            result.timings_ms["wall"],
         )
         for sink in sinks:
-            sink.frame(frame, result)
+            sink.frame(prepared.frame, result)
 
 
-def _read_ahead(sequence: Sequence, indices: range) -> Iterator[tuple[int, Future[Frame]]]:
-    """Frames in order, the next one being read while the present one is processed."""
-    with ThreadPoolExecutor(1, thread_name_prefix="reader") as reader:
-        pending = reader.submit(sequence.read, indices[0])
+def _prepare_ahead(
+    sequence: Sequence, slam: DyObSlam, indices: range
+) -> Iterator[tuple[int, Future[PreparedFrame]]]:
+    """Frames in order, the next being read and prepared while the present one is processed."""
+
+    def prepare(index: int) -> PreparedFrame:
+        frame = sequence.read(index)
+        _check_size(sequence, frame)
+        return slam.prepare(frame)
+
+    with ThreadPoolExecutor(1, thread_name_prefix="prepare") as ahead:
+        pending = ahead.submit(prepare, indices[0])
         for position, index in enumerate(indices):
             current = pending
             if position + 1 < len(indices):
-                pending = reader.submit(sequence.read, indices[position + 1])
+                pending = ahead.submit(prepare, indices[position + 1])
             yield index, current
 
 

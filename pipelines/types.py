@@ -216,7 +216,8 @@ class FrameResult:
     keypoints_px: (N, 2) static keypoints that the pose was measured with, and candidates.
     point_ids: (N,) int64, the map point each keypoint observes, -1 where it observes none.
     inliers: (N,) bool, whether the observation agreed with the pose.
-    timings_ms: wall time of each stage of this frame, plus "total".
+    timings_ms: time of each stage of this frame; "total", their sum; in a run also "wall", the time
+        since the result before this one, which is less as frames are prepared ahead.
     """
 
     frame_index: int

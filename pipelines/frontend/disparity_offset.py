@@ -9,7 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.frontend.motion_only_ba import StereoObservations, observation_covariance
+from pipelines.frontend.motion_only_ba import (
+    StereoObservations,
+    observation_covariance,
+    whitening,
+)
 from pipelines.geometry import (
     invert_T,
     pose_jacobian,
@@ -55,23 +59,22 @@ class DisparityOffset:
         R = T_world_camera[:3, :3]
         points = transform_points(invert_T(T_world_camera), observations.points_world_m)
         D = projection_jacobian(camera, points)
-        J = pose_jacobian(D, points)
-        information = np.linalg.inv(observation_covariance(camera, T_world_camera, observations))
+        W = whitening(observation_covariance(camera, T_world_camera, observations))
         residual = observations.uvr_px - project_stereo(camera, points)
-        slope = -np.einsum("nij,nj->ni", D, sensitivities @ R)  # d residual / d offset
+        slope = -(D @ (sensitivities @ R)[..., None])[..., 0]  # d residual / d offset
         slope[:, 2] -= 1.0
         mono = np.isnan(residual[:, 2])
-        information[mono] = _without_disparity(information[mono])
-        residual[mono, 2] = slope[mono, 2] = 0.0
-        weighted = information @ J
-        H = np.einsum("nij,nik->jk", J, weighted)
-        pose_slope = np.linalg.solve(H + 1e-9 * np.eye(6), np.einsum("nij,ni->j", weighted, slope))
+        residual[mono, 2] = 0.0
+        W[mono, 2] = 0.0  # the first two rows do not know of the third
+        J = (W @ pose_jacobian(D, points)).reshape(-1, 6)
+        slope = (W @ slope[..., None]).ravel()
+        residual = (W @ residual[..., None]).ravel()
+        pose_slope = np.linalg.solve(J.T @ J + 1e-9 * np.eye(6), J.T @ slope)
         slope -= J @ pose_slope  # what is left once the pose has followed the offset
-        evidence = np.einsum("nij,nj->ni", information, slope)
         self._information *= _FORGET
         self._gradient *= _FORGET
-        self._information += _INDEPENDENT_SHARE * float((evidence * slope).sum())
-        self._gradient += _INDEPENDENT_SHARE * float((evidence * residual).sum())
+        self._information += _INDEPENDENT_SHARE * float(slope @ slope)
+        self._gradient += _INDEPENDENT_SHARE * float(slope @ residual)
         return pose_slope
 
     def step(self) -> float:
@@ -84,14 +87,6 @@ class DisparityOffset:
         self.offset_px += step
         self._gradient += self._information * step
         return step
-
-
-def _without_disparity(information: Array) -> Array:
-    """Information (N, 3, 3) of (u_L, v, u_R) where u_R was not measured: its marginal."""
-    out = np.zeros_like(information)
-    a, b, c = information[:, :2, :2], information[:, :2, 2], information[:, 2, 2]
-    out[:, :2, :2] = a - b[:, :, None] * b[:, None, :] / c[:, None, None]
-    return out
 
 
 def follow_camera(T_world_camera: Array, points_world_m: Array, pose_slope: Array) -> Array:

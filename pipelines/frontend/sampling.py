@@ -14,6 +14,11 @@ _HALF = 2  # px, half the window of the local disparity plane: 5 x 5 pixels
 _EDGE_SHARE = 0.04  # a neighbour whose disparity differs by more than this share is across an edge
 _EDGE_SIGMAS = 4.0  # plus this many standard deviations of a single pixel's disparity
 _MIN_SUPPORT = 0.6  # share of the window that must lie on the plane
+_DX, _DY = (
+    grid.ravel() for grid in np.meshgrid(np.arange(-_HALF, _HALF + 1), np.arange(-_HALF, _HALF + 1))
+)  # px, of the window's pixels from its centre
+_INNER = (np.abs(_DX) <= 1) & (np.abs(_DY) <= 1)
+_MOMENTS = np.stack([np.ones(len(_DX)), _DX, _DY, _DX**2, _DY**2, _DX * _DY], -1)
 
 
 def sample_bilinear(image: NDArray[np.float32], uv_px: Array) -> Array:
@@ -46,25 +51,37 @@ def sample_disparity(disparity_px: NDArray[np.float32], uv_px: Array, sigma_px: 
     if len(uv_px) == 0:
         return np.empty(0)
     H, W = disparity_px.shape
-    span = np.arange(-_HALF, _HALF + 1)
-    dx, dy = (grid.ravel() for grid in np.meshgrid(span, span))
     x0 = np.clip(np.rint(uv_px[:, 0]).astype(np.int64), _HALF, W - 1 - _HALF)
     y0 = np.clip(np.rint(uv_px[:, 1]).astype(np.int64), _HALF, H - 1 - _HALF)
-    window = disparity_px[y0[:, None] + dy, x0[:, None] + dx].astype(np.float64)
-    inner = (np.abs(dx) <= 1) & (np.abs(dy) <= 1)
-    centre = np.sort(window[:, inner], axis=1)  # NaN sorts last
+    window = disparity_px[y0[:, None] + _DY, x0[:, None] + _DX].astype(np.float64)
+    centre = np.sort(window[:, _INNER], axis=1)  # NaN sorts last
     n_valid = np.isfinite(centre).sum(1)
     median = centre[np.arange(len(centre)), np.maximum(n_valid - 1, 0) // 2]
     edge = _EDGE_SHARE * median + _EDGE_SIGMAS * sigma_px
-    on_plane = np.abs(window - median[:, None]) < edge[:, None]
-    weight = on_plane.astype(np.float64)
-    value = np.where(on_plane, window - median[:, None], 0.0)
-    ox = (x0 - uv_px[:, 0])[:, None] + dx
-    oy = (y0 - uv_px[:, 1])[:, None] + dy
-    basis = np.stack([np.ones_like(ox), ox, oy], -1)  # d = c0 + c1 du + c2 dv
-    weighted = basis * weight[..., None]
-    normal = weighted.transpose(0, 2, 1) @ basis + np.diag([1e-9, 1e-3, 1e-3])
-    rhs = (weighted.transpose(0, 2, 1) @ value[..., None])[..., 0]
-    offset = np.linalg.solve(normal, rhs[..., None])[:, 0, 0]
-    supported = weight.sum(1) >= _MIN_SUPPORT * len(dx)
+    window -= median[:, None]
+    on_plane = np.abs(window) < edge[:, None]
+    offset = _plane_at(
+        np.where(on_plane, window, 0.0),
+        on_plane.astype(np.float64),
+        uv_px[:, 0] - x0,
+        uv_px[:, 1] - y0,
+    )
+    supported = on_plane.sum(1) >= _MIN_SUPPORT * len(_DX)
     return np.where(supported, median + offset, np.nan)
+
+
+def _plane_at(value: Array, weight: Array, du: Array, dv: Array) -> Array:
+    """Least-squares planes through windows (N, 25) with weights (N, 25), at (du, dv) off centre.
+
+    The normal equations of d = c0 + c1 du + c2 dv are solved by Cramer's rule, as there are many.
+    """
+    n, x, y, xx, yy, xy = (weight @ _MOMENTS).T
+    d, dx, dy = (value @ _MOMENTS[:, :3]).T
+    n, xx, yy = n + 1e-9, xx + 1e-3, yy + 1e-3
+    a, b, c = xx * yy - xy * xy, xy * y - x * yy, x * xy - xx * y
+    e, f, g = n * yy - y * y, x * y - n * xy, n * xx - x * x
+    determinant = n * a + x * b + y * c
+    c0 = a * d + b * dx + c * dy
+    c1 = b * d + e * dx + f * dy
+    c2 = c * d + f * dx + g * dy
+    return (c0 + c1 * du + c2 * dv) / determinant

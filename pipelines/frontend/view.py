@@ -1,11 +1,12 @@
 """What the front-end sees of one frame: grey image, disparity, static pixels and features.
 
-Owns the turning of a `Frame` into a `View`, once per frame. Knows no poses.
+Owns the turning of a `Frame` into a `View`: a part that may run ahead in another thread, and a part
+that needs what was learned of the sensor. Knows no poses.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -84,6 +85,64 @@ def normalise_contrast(gray: Image) -> Image:
     return cv2.add(cv2.multiply(gray, gain, dtype=cv2.CV_32F), shift, dtype=cv2.CV_8U)
 
 
+@dataclass(frozen=True, slots=True)
+class PreparedFrame:
+    """What can be said of a frame before anything is known of its pose, or of the sensor's errors.
+
+    disparity_px: (H, W) float32 as measured, NaN where unknown. static: (H, W) bool. features: ORB
+    on static pixels, without depth. timings_ms: wall time of each stage so far.
+    """
+
+    frame: Frame
+    gray: Image
+    disparity_px: NDArray[np.float32]
+    static: NDArray[np.bool_]
+    features: Features
+    timings_ms: dict[str, float] = field(default_factory=dict)
+
+
+def prepare_frame(
+    camera: StereoCamera, frame: Frame, depth_m: NDArray[np.float32] | None, orb: OrbExtractor
+) -> PreparedFrame:
+    """Grey image, disparities, static pixels and features of a frame with depth (H, W) in m."""
+    gray = to_gray(frame.image)
+    if depth_m is None:
+        disparity = np.full(gray.shape, np.nan, np.float32)
+    else:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            disparity = np.where(depth_m > 0, np.float32(camera.bf) / depth_m, np.float32(np.nan))
+        disparity = disparity.astype(np.float32, copy=False)
+    static = static_pixels(frame.instance_labels, gray.shape, orb.config.mask_dilation_px)
+    features = orb.extract(normalise_contrast(gray), static)
+    return PreparedFrame(frame, gray, disparity, static, features)
+
+
+def complete_view(
+    camera: StereoCamera,
+    prepared: PreparedFrame,
+    sigma_disparity_px: float,
+    disparity_offset_px: float,
+) -> View:
+    """The view of a prepared frame, by what is known of the sensor's disparities now."""
+    disparity, features = prepared.disparity_px, prepared.features
+    if disparity_offset_px != 0.0:
+        disparity = disparity + np.float32(disparity_offset_px)
+    disparity_at = sample_disparity(disparity, features.uv_px, sigma_disparity_px)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        features = features.with_depth(np.where(disparity_at > 0, camera.bf / disparity_at, np.nan))
+    frame = prepared.frame
+    return View(
+        frame.index,
+        frame.timestamp_s,
+        frame.image,
+        prepared.gray,
+        disparity,
+        prepared.static,
+        features,
+        frame.flow_prev_to_curr_px,
+    )
+
+
 def make_view(
     camera: StereoCamera,
     frame: Frame,
@@ -93,25 +152,5 @@ def make_view(
     disparity_offset_px: float,
 ) -> View:
     """The view of a frame whose depth (H, W) in m is known; None means no depth at all."""
-    gray = to_gray(frame.image)
-    if depth_m is None:
-        disparity = np.full(gray.shape, np.nan, np.float32)
-    else:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            disparity = np.where(depth_m > 0, np.float32(camera.bf) / depth_m, np.float32(np.nan))
-        disparity = disparity.astype(np.float32) + np.float32(disparity_offset_px)
-    static = static_pixels(frame.instance_labels, gray.shape, orb.config.mask_dilation_px)
-    features = orb.extract(normalise_contrast(gray), static)
-    disparity_at = sample_disparity(disparity, features.uv_px, sigma_disparity_px)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        features = features.with_depth(np.where(disparity_at > 0, camera.bf / disparity_at, np.nan))
-    return View(
-        frame.index,
-        frame.timestamp_s,
-        frame.image,
-        gray,
-        disparity,
-        static,
-        features,
-        frame.flow_prev_to_curr_px,
-    )
+    prepared = prepare_frame(camera, frame, depth_m, orb)
+    return complete_view(camera, prepared, sigma_disparity_px, disparity_offset_px)

@@ -53,6 +53,7 @@ class Drive:
             if index > 0:
                 T = self.follow(T, self.row_of[seen[known]], uv[known], disparity[known])
             self.add(T, seen[~known], uv[~known], disparity[~known])
+            self.map.shift_offset(np.flatnonzero(self.map.alive), self.offset.step())
             self.Ts.append(T)
         return self
 
@@ -64,7 +65,7 @@ class Drive:
         T, kept = estimate.T_world_camera, estimate.inliers
         rows, slopes = rows[kept], self.map.offset_slope[rows[kept]]
         pose_slope = self.offset.learn(CAMERA, T, observations[kept], slopes)
-        self.map.shift_offset(rows, T, pose_slope, self.offset.step())
+        self.map.hold_camera(rows, T, pose_slope)
         observations = self.map.observe(tracks[kept], SIGMA_DISPARITY_PX)
         points, covariances, slopes = refine_points(
             CAMERA, T, estimate.covariance, observations, self.map.offset_slope[rows]

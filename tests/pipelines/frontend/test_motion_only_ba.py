@@ -229,3 +229,38 @@ def test_observations_are_chosen_by_index_or_mask():
         assert len(chosen) == 2
         np.testing.assert_array_equal(chosen.uvr_px, observations.uvr_px[which])
         np.testing.assert_array_equal(chosen.points_world_m, observations.points_world_m[which])
+
+
+@pytest.mark.parametrize(("scale", "x"), [(0.1, 100.0), (10.0, 10.0), (10.0, 1000.0)])
+def test_one_vague_point_behind_the_camera_spoils_no_pose(scale, x):
+    """Its covariance in the image is of rank 1 in double precision: it must count for nothing."""
+    observations = observe(np.random.default_rng(1), 120)
+    points = transform_points(invert_T(T_TRUE), observations.points_world_m)
+    points[0] = [x, 1.0, -0.5]
+    covariances = observations.point_covariances_m2.copy()
+    covariances[0] = np.outer(points[0], points[0]) * scale**2
+    observations = replace(
+        observations,
+        points_world_m=transform_points(T_TRUE, points),
+        point_covariances_m2=covariances,
+    )
+    estimate = estimate_camera_pose(CAMERA, GUESS, observations)
+    assert error_m_deg(estimate.T_world_camera)[0] < 0.02
+    assert estimate.n_inliers > 100
+
+
+def test_a_guess_with_far_points_behind_it_still_moves():
+    """Half-known depths (the mapping's far points) and a guess turned by 57 degrees."""
+    observations = observe(np.random.default_rng(0), 120)
+    points = transform_points(invert_T(T_TRUE), observations.points_world_m)
+    far = points[:, 2] > 30
+    ray = points @ T_TRUE[:3, :3].T
+    C = observations.point_covariances_m2.copy()
+    C[far] = 0.25 * np.einsum("ni,nj->nij", ray[far], ray[far])
+    estimate = estimate_camera_pose(
+        CAMERA,
+        T_TRUE @ exp_se3(np.array([0, 1.0, 0, 0, 0, 0])),
+        replace(observations, point_covariances_m2=C),
+    )
+    assert np.isfinite(estimate.covariance).all() or estimate.n_inliers == 0
+    assert error_m_deg(estimate.T_world_camera)[1] < 50  # at least some step was taken

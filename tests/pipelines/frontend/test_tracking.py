@@ -6,6 +6,7 @@ import pytest
 
 from pipelines.config import Config, OrbConfig, TrackingConfig
 from pipelines.frontend.orb import OrbExtractor
+from pipelines.frontend.rgbd_odometry import estimate_rgbd_odometry
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame, Tracker
 from pipelines.frontend.view import make_view
@@ -216,3 +217,10 @@ def test_tracking_repeats_itself_to_the_last_bit():
         run = Run().begin(path(0))
         poses.append([run.track(path(k), k).T_world_camera for k in range(1, 4)])
     np.testing.assert_array_equal(poses[0], poses[1])
+
+
+def test_dense_odometry_finds_a_step_whatever_the_far_limit():
+    a, b = look(path(2))[:2], look(path(3))[:2]
+    for max_depth_m in (10.0, 50.0, 312.0):
+        T = estimate_rgbd_odometry(CAMERA, a, b, np.eye(4), max_depth_m)
+        assert error_m_deg(path(2) @ T, path(3))[0] < 0.01, max_depth_m

@@ -162,3 +162,10 @@ def test_frame_is_not_changed():
     make_view(CAMERA, frame, depth, ORB, 0.1, 0.3)
     for now, then in zip((frame.image, depth, frame.instance_labels), before, strict=True):
         np.testing.assert_array_equal(now, then)
+
+
+def test_depth_of_static_pixels_is_never_negative_or_infinite():
+    far = np.full((H, W), 2000.0, np.float32)  # 0.06 px of disparity
+    view = view_of(far, offset_px=-0.2)
+    depth = view.depth_of_static_m(CAMERA)
+    assert np.isnan(depth).all() or depth[np.isfinite(depth)].min() > 0

@@ -305,3 +305,11 @@ def test_snapshot_before_the_first_keyframe_is_empty(with_points):
     static_map = sparse_map.snapshot()
     assert len(static_map) == 0
     assert static_map.keyframe_Ts_world_camera.shape == (0, 4, 4)
+
+
+def test_covisible_keyframes_are_most_shared_first_for_older_ones_too():
+    sparse_map = new_map()
+    ids = sparse_map.add_points(*random_points(120))
+    for k, seen in enumerate((ids, ids[:20], ids[:90])):
+        sparse_map.add_keyframe(keyframe_of(seen, frame_index=k))
+    assert sparse_map.covisible_keyframes(0).tolist() == [2, 1]
