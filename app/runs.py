@@ -46,6 +46,7 @@ def demo(arguments: Namespace) -> int:
     """`demo`: a small simulated sequence, its result, its pictures, and what to do next."""
     from pipelines.config import load_config
     from pipelines.datasets import open_sequence
+    from viz.plots import plot_result
     from viz.render import render_result
 
     quiet = arguments.quiet
@@ -56,7 +57,7 @@ def demo(arguments: Namespace) -> int:
     if result.metrics["run"]["interrupted"]:
         return INTERRUPTED
     with console.working("drawing the map and the trajectory", quiet):
-        pictures = render_result(result.folder)
+        pictures = render_result(result.folder) + plot_result(result.folder)
     console.pictures(pictures)
     if not quiet:
         if arguments.pictures:
@@ -86,6 +87,7 @@ def evaluate(arguments: Namespace) -> int:
 def render(arguments: Namespace) -> int:
     """`render RESULT`: PNG files in the result folder."""
     from pipelines.io.folder import open_result_folder
+    from viz.plots import plot_result
     from viz.render import render_result
 
     folder = open_result_folder(arguments.result)
@@ -96,6 +98,7 @@ def render(arguments: Namespace) -> int:
             views=tuple(arguments.views),
             background=arguments.background,
         )
+        pictures += plot_result(folder)
     console.pictures(pictures)
     return 0
 

@@ -19,7 +19,7 @@ from pipelines.geometry import rotation_angle_deg
 from pipelines.io import folder as names
 from pipelines.io.files import disk_error, replacing
 from pipelines.io.result import Result, load_result
-from pipelines.io.timings import TOTAL, stage_summaries
+from pipelines.io.timings import TOTAL, WALL, stage_summaries
 from viz import style
 
 SETTINGS = {
@@ -144,7 +144,7 @@ def _plot_timings(figure: Any, result: Result) -> None:
     labels = [name.replace("_", " ") for name in stages]
     medians = np.array([values["median_ms"] for values in stages.values()])
     p95 = np.array([values["p95_ms"] for values in stages.values()])
-    colors = [_hex(style.INK if name == TOTAL else style.ESTIMATE) for name in stages]
+    colors = [_hex(style.INK if name in (TOTAL, WALL) else style.ESTIMATE) for name in stages]
     lower.barh(labels, p95, color="#d5dce4", label="95th percentile")
     lower.barh(labels, medians, color=colors, height=0.5, label="median")
     for row, value in enumerate(medians):

@@ -37,6 +37,11 @@ class NoiseModel:
     ceiling_px: float = 2.0
     _seen: set[str] = field(default_factory=set)
 
+    @property
+    def is_learned(self) -> bool:
+        """Whether any residuals were taken in yet."""
+        return bool(self._seen)
+
     def _blend(self, source: str, old: float, residuals: Array) -> float:
         if residuals.size < _MIN_SAMPLES:
             return old

@@ -102,7 +102,11 @@ class Tracker:
         share = estimate.n_inliers / len(measured.tracks)
         if estimate.n_inliers < self.config.min_inliers or share < self.config.min_inlier_share:
             return self._lost(T_predicted, measured.tracks)
+        first = not self.noise.is_learned
         self._learn_noise(sparse_map, measured, estimate)
+        if first:  # the weights were guesses: once more with what they taught
+            measured = self._measure(view, sparse_map, estimate.T_world_camera)
+            estimate = self._adjust(sparse_map, measured.tracks, estimate.T_world_camera)
         with stage("local_map"):
             T, tracks = estimate.T_world_camera, measured.tracks
             found, visible = search_local_map(view, sparse_map, tracks, T, self.sensor, self.config)

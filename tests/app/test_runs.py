@@ -31,7 +31,11 @@ def calls(monkeypatch, tmp_path) -> dict[str, Any]:
         seen.update(rendered=folder, options=options)
         return [Path(folder) / "renders" / "top.png"]
 
-    for name, function in (("pipelines.runner", run), ("viz.render", render_result)):
+    def plot_result(folder):
+        return [Path(folder) / "plots" / "trajectory.png"]
+
+    stand_ins = {"pipelines.runner": run, "viz.render": render_result, "viz.plots": plot_result}
+    for name, function in stand_ins.items():
         module = ModuleType(name)
         setattr(module, function.__name__, function)
         monkeypatch.setitem(sys.modules, name, module)

@@ -72,8 +72,11 @@ def test_render_draws_pictures_of_the_size_asked_for(result: Path) -> None:
     done = app("render", result, "--size", "320x200")
     assert done.returncode == 0, done.stderr
     files = [Path(line) for line in done.stdout.splitlines() if line.endswith(".png")]
-    assert files
-    for file in files:
+    diagrams = [file for file in files if file.parent.name == "plots"]
+    assert len(diagrams) == 3
+    maps = [file for file in files if file.parent.name == "renders"]
+    assert len(maps) == 2
+    for file in maps:
         image = cv2.imread(str(ROOT / file))
         assert image.shape == (200, 320, 3)
         assert image.std() > 1.0, f"{file} is empty"
