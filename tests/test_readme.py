@@ -1,0 +1,55 @@
+"""What the README promises: its script runs, its commands parse, its files and names exist."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from app import cli
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^python3 -m app (.+?)(?:\s+#.*)?$", README, re.MULTILINE)
+
+
+def test_the_script_runs(tmp_path: Path) -> None:
+    (script,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    first, second = done.stdout.splitlines()
+    assert 0 < float(first.split()[-1]) < 0.01
+    assert second == "(40, 4, 4)"
+
+
+def test_there_are_commands() -> None:
+    assert {shlex.split(command)[0] for command in COMMANDS} >= {"demo", "test", "run", "render"}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_command_parses(command: str) -> None:
+    arguments = cli.build_parser().parse_args(shlex.split(command))
+    assert arguments.verb == shlex.split(command)[0]
+
+
+@pytest.mark.parametrize("picture", re.findall(r"\]\((\.github/[^)]+)\)", README))
+def test_each_picture_is_there(picture: str) -> None:
+    assert (ROOT / picture).is_file()
+
+
+@pytest.mark.parametrize("path", sorted(set(re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.py)`", README))))
+def test_each_file_is_where_it_says(path: str) -> None:
+    assert (ROOT / path).is_file() or (ROOT / "pipelines" / path).is_file()
