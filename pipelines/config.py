@@ -1,6 +1,7 @@
-"""The settings of every step: nested frozen dataclasses with the paper's values as defaults.
+"""The settings of every step: nested frozen dataclasses, the paper's values where it gives any.
 
-Each step gets its own section only. Owns the values' meaning; reading and overriding is below.
+Each step gets its own section only. Owns the values' meaning, ranges and sources, and reading them
+from a file and the command line; merging and type checks are in `settings`.
 """
 
 from __future__ import annotations
@@ -27,11 +28,12 @@ def _check(section: object, **ranges: tuple[float, float]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class DepthConfig:
-    """Step 0: depth from stereo, and which depths count as near."""
+    """Step 0: depth from stereo, and which depths count as close."""
 
-    close_baselines: float = 40.0  # a point is close when z < this many baselines (paper, ORB)
-    max_depth_m: float = 0.0  # ThDepth: ignore depths beyond this, 0 = the close rule alone
-    relative_error: float = 0.02  # a point is close too when its depth is this well measured
+    close_baselines: float = 40.0  # a point is close when z < this many baselines (paper)
+    max_depth_m: float = 0.0  # m, ThDepth: points beyond are far, 0 = the close rule alone
+    relative_error: float = 0.02  # sigma_z / z below which a point is close too
+    calibrate_disparity: bool = True  # learn a constant error of the stereo disparities
     sgbm_num_disparities: int = 96  # px, search range of the stereo matcher, multiple of 16
     sgbm_block_size: int = 3  # px, odd
     left_right_max_px: float = 1.0  # px, left-right check of disparities
@@ -47,8 +49,8 @@ class OrbConfig:
     """Step 3: ORB features on static pixels."""
 
     n_features: int = 1500  # per image, after even spreading
-    n_levels: int = 8  # pyramid levels (paper)
-    scale_factor: float = 1.2  # between levels (paper, as ORB-SLAM)
+    n_levels: int = 8  # pyramid levels (ORB-SLAM)
+    scale_factor: float = 1.2  # between levels (ORB-SLAM)
     fast_threshold: int = 24  # grey levels, FAST corner threshold after contrast is evened
     mask_dilation_px: int = 7  # px, movable masks grow by this before features are kept off them
 
@@ -65,21 +67,19 @@ class TrackingConfig:
     search_radius_px: float = 25.0  # px, around motion-predicted places, without flow
     flow_tolerance_px: float = 6.0  # px, alignment may move a point this far from its flow
     map_radius_px: float = 10.0  # px, around local-map points once the pose is known
-    max_hamming: int = 64  # bits of 256, of an accepted ORB match
+    max_hamming: int = 64  # bits of 256, of an accepted ORB match where a place is predicted
     inlier_px: float = 2.0  # px, reprojection error of an inlier of a motion hypothesis
-    weak_inlier_share: float = 0.5  # below this share of inliers, dense odometry joins in
-    min_inliers: int = 20  # fewer than this after bundle adjustment is LOST
+    weak_inlier_share: float = 0.5  # below it dense odometry, then relocalisation joins in
+    min_inliers: int = 20  # fewer than this after bundle adjustment is LOST; also to start with
     min_inlier_share: float = 0.1  # so is a smaller share of the points measured
-    min_points_apart_px: float = 5.0  # px, new points keep this far from tracked ones
     restart_after_frames: int = 5  # LOST frames with features before tracking starts anew
     use_rgbd_odometry: bool = True  # Open3D's dense odometry as the third hypothesis
-    calibrate_disparity: bool = True  # learn a constant error of the stereo disparities
 
     def __post_init__(self) -> None:
         _check(self, seed=(0, 2**31 - 1), search_radius_px=(1, 500), flow_tolerance_px=(0, 100))
         _check(self, map_radius_px=(1, 100), max_hamming=(0, 256), inlier_px=(0.1, 50))
         _check(self, weak_inlier_share=(0, 1), min_inlier_share=(0, 1), min_inliers=(6, _ANY))
-        _check(self, min_points_apart_px=(0, 100), restart_after_frames=(1, _ANY))
+        _check(self, restart_after_frames=(1, _ANY))
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,20 +88,22 @@ class MappingConfig:
 
     keyframe_min_overlap: float = 0.7  # share of tracked points that the last keyframe saw
     keyframe_max_interval: int = 20  # frames between keyframes at most
-    local_keyframes: int = 20  # keyframes whose points make the local map
+    min_points_apart_px: float = 5.0  # px, new points keep this far from tracked ones
+    local_keyframes: int = 20  # keyframes of the local map by shared points; as many by place
     near_keyframe_baselines: float = 15.0  # keyframes this near in place join the local map
     min_shared_points: int = 15  # points in common that make keyframes covisible (ORB-SLAM)
     min_parallax_deg: float = 1.0  # deg, of a point triangulated from two keyframes
     max_reprojection_px: float = 2.0  # px at octave 0, of a triangulated point
     max_epipolar_px: float = 1.5  # px at octave 0, from the epipolar line
     min_triangulation_baselines: float = 1.0  # baselines between keyframes to triangulate from
-    triangulate_with: int = 2  # covisible keyframes that a new keyframe is matched to
+    triangulate_with: int = 2  # local keyframes that a new keyframe is triangulated with
     min_found_ratio: float = 0.25  # found / visible below which a point is culled (ORB-SLAM)
     min_observations: int = 3  # frames that must have seen a point of the saved map
     max_relative_depth_sigma: float = 0.1  # standard deviation / distance of a saved point
 
     def __post_init__(self) -> None:
         _check(self, keyframe_min_overlap=(0, 1), keyframe_max_interval=(1, _ANY))
+        _check(self, min_points_apart_px=(0, 100))
         _check(self, local_keyframes=(1, _ANY), near_keyframe_baselines=(0, _ANY))
         _check(self, min_shared_points=(1, _ANY), min_parallax_deg=(0.01, 90))
         _check(self, max_reprojection_px=(0.1, 50), max_epipolar_px=(0.1, 50))

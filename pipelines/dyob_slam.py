@@ -20,9 +20,9 @@ from pipelines.frontend.orb import OrbExtractor
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame, Tracker
 from pipelines.frontend.view import PreparedFrame, View, complete_view, prepare_frame
-from pipelines.mapping.keyframe import Tracks
 from pipelines.mapping.local_mapping import LocalMapping
 from pipelines.mapping.sparse_map import SparseMap
+from pipelines.observations import Tracks
 from pipelines.types import (
     Array,
     Frame,
@@ -49,7 +49,7 @@ class DyObSlam:
         self._stereo: StereoDepth | None = None
         self.sensor = Sensor(camera, self.config.depth)
         self._tracker = Tracker(self.sensor, self.config.tracking)
-        self._mapping = LocalMapping(self.sensor, self.config)
+        self._mapping = LocalMapping(self.sensor, self.config.mapping, self.config.orb)
         self._lost_frames = 0
         self._timings_ms: dict[str, float] = {}
 

@@ -1,6 +1,7 @@
 """Rigid motions and the stereo pinhole model, vectorised over leading axes.
 
-Owns SE(3) algebra (right perturbation, order [omega, v]) and projection. Knows no images.
+Owns SE(3) algebra (right perturbation T exp(xi), order [omega rad, v m]) and projection, pi(.) of
+the paper. Knows no images.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def exp_se3(xi: Array) -> Array:
 
 
 def orthonormalise(T: Array) -> Array:
-    """`T` with its rotation replaced by the nearest true rotation (drift of long products)."""
+    """`T` (..., 4, 4) with the nearest true rotation in place of its own (long products drift)."""
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     out = T.copy()
     out[..., :3, :3] = U @ Vt
@@ -100,14 +101,31 @@ def T_from_q_xyzw(t: Array, q_xyzw: Array) -> Array:
 
 
 def project_stereo(camera: StereoCamera, points_camera: Array) -> Array:
-    """Stereo pixels (N, 3) [u_L, v, u_R] of points (N, 3) in the camera; z must be positive."""
+    """Stereo pixels (N, 3) [u_L, v, u_R] of points (N, 3) in the camera, in m; z must be positive.
+
+    pi(.) of the paper, extended by u_R = u_L - bf / z.
+    """
     x, y, z = points_camera.T
     u = camera.fx * x / z + camera.cx
     return np.stack([u, camera.fy * y / z + camera.cy, u - camera.bf / z], -1)
 
 
+def reprojection_errors(
+    camera: StereoCamera, T_world_camera: Array, points_world_m: Array, uv_px: Array
+) -> Array:
+    """Distances (N,) in px between pixels (N, 2) and the projections of points (N, 3).
+
+    |e(X_k)| of eq. (1), in the left image; infinite where a point lies behind the camera.
+    """
+    points = transform_points(invert_T(T_world_camera), points_world_m)
+    front = points[:, 2] > MIN_DEPTH_M
+    points[~front, 2] = 1.0
+    error = np.linalg.norm(project_stereo(camera, points)[:, :2] - uv_px, axis=1)
+    return np.where(front, error, np.inf)
+
+
 def projection_jacobian(camera: StereoCamera, points_camera: Array) -> Array:
-    """d(u_L, v, u_R) / d(point in the camera), (N, 3, 3)."""
+    """d(u_L, v, u_R) / d(point in the camera), (N, 3, 3), of points (N, 3) in px / m."""
     x, y, z = points_camera.T
     z = np.maximum(z, MIN_DEPTH_M)
     J = np.zeros((len(z), 3, 3))
@@ -120,7 +138,10 @@ def projection_jacobian(camera: StereoCamera, points_camera: Array) -> Array:
 
 
 def pose_jacobian(projection_jacobians: Array, points_camera: Array) -> Array:
-    """d(u_L, v, u_R) / d(right perturbation [omega, v] of T_world_camera), (N, 3, 6)."""
+    """d(u_L, v, u_R) / d(right perturbation [omega, v] of T_world_camera), (N, 3, 6).
+
+    projection_jacobians: (N, 3, 3) of points_camera (N, 3), in the camera.
+    """
     J = np.empty((len(points_camera), 3, 6))
     J[:, :, :3] = projection_jacobians @ skew(points_camera)
     J[:, :, 3:] = -projection_jacobians

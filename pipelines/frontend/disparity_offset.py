@@ -3,17 +3,15 @@
 A tenth of a pixel of disparity error makes far points half a percent too far and every step of the
 camera as much too long. Near and far points then disagree about the camera's motion, which makes
 the error observable. Owns that estimate; the map keeps how each point depends on it.
+
+Deviation: the paper trusts the calibration.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from pipelines.frontend.motion_only_ba import (
-    StereoObservations,
-    observation_covariance,
-    whitening,
-)
+from pipelines.frontend.motion_only_ba import observation_covariance, whitening
 from pipelines.geometry import (
     invert_T,
     pose_jacobian,
@@ -22,6 +20,7 @@ from pipelines.geometry import (
     skew,
     transform_points,
 )
+from pipelines.observations import StereoObservations
 from pipelines.types import Array, StereoCamera
 
 _PRIOR_SIGMA_PX = 1.0  # a rectified pair is off by less than this
@@ -36,12 +35,12 @@ class DisparityOffset:
 
     def __init__(self) -> None:
         self.offset_px = 0.0
-        self._information = 0.0
-        self._gradient = 0.0
+        self._information = 0.0  # 1 / px^2
+        self._gradient = 0.0  # 1 / px, of half the cost at the present offset
 
     @property
     def sigma_px(self) -> float:
-        """Standard deviation of the offset."""
+        """Standard deviation of the offset in px."""
         return (self._information + _PRIOR_SIGMA_PX**-2) ** -0.5
 
     def learn(
@@ -49,19 +48,19 @@ class DisparityOffset:
         camera: StereoCamera,
         T_world_camera: Array,
         observations: StereoObservations,
-        sensitivities: Array,
+        offset_slopes: Array,
     ) -> Array:
         """Take in the inliers of one frame, at the pose that fits them best.
 
-        sensitivities: (N, 3) d(point in the world) / d(offset). Returns how the camera's pose
-        depends on the offset, (6,) d[omega, v] / d(offset), right perturbation.
+        offset_slopes: (N, 3) d(point in the world) / d(offset), m / px. Returns how the camera's
+        pose depends on the offset, (6,) d[omega, v] / d(offset), right perturbation.
         """
         R = T_world_camera[:3, :3]
         points = transform_points(invert_T(T_world_camera), observations.points_world_m)
         D = projection_jacobian(camera, points)
         W = whitening(observation_covariance(camera, T_world_camera, observations))
         residual = observations.uvr_px - project_stereo(camera, points)
-        slope = -(D @ (sensitivities @ R)[..., None])[..., 0]  # d residual / d offset
+        slope = -(D @ (offset_slopes @ R)[..., None])[..., 0]  # d residual / d offset
         slope[:, 2] -= 1.0
         mono = np.isnan(residual[:, 2])
         residual[mono, 2] = 0.0
@@ -92,7 +91,8 @@ class DisparityOffset:
 def follow_camera(T_world_camera: Array, points_world_m: Array, pose_slope: Array) -> Array:
     """(N, 3) d(point in the world) / d(offset) due to the camera's own dependence `pose_slope`.
 
-    Added to the points' sensitivities, it expresses them with the present camera held still.
+    points_world_m: (N, 3). pose_slope: (6,) d[omega, v] / d(offset), as `learn` answers. Added to
+    the points' own slopes, it expresses them with the present camera held still.
     """
     points = transform_points(invert_T(T_world_camera), points_world_m)
     in_camera = np.einsum("nij,j->ni", skew(points), pose_slope[:3]) - pose_slope[3:]

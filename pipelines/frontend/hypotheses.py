@@ -12,23 +12,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry import (
-    MIN_DEPTH_M,
     T_from_q_xyzw,
     invert_T,
     make_T,
-    project_stereo,
     q_xyzw_from_T,
-    transform_points,
+    reprojection_errors,
 )
 from pipelines.types import Array, MotionHypothesis, StereoCamera
 
 _RANSAC_ITERATIONS = 200
 _RANSAC_CONFIDENCE = 0.999
+_MIN_POINTS = 6  # AP3P takes four, but their agreement alone proves nothing
 
 
 @dataclass(slots=True)
 class ConstantVelocity:
-    """The camera's last motion, as a rate, so that uneven time stamps and dropped frames count."""
+    """The camera's last motion, as a rate, so that uneven time stamps and dropped frames count.
+
+    T_world_camera: (4, 4) last measured, at `timestamp_s`. The paper's "previous camera motion".
+    """
 
     T_world_camera: Array
     timestamp_s: float
@@ -63,9 +65,9 @@ def estimate_pnp(
     camera: StereoCamera, points_world_m: Array, uv_px: Array, inlier_px: float, seed: int
 ) -> Array | None:
     """T_world_camera (4, 4) by PnP RANSAC (AP3P) from points (N, 3) and pixels (N, 2), or None."""
-    if len(points_world_m) < 6:
+    if len(points_world_m) < _MIN_POINTS:
         return None
-    order = np.random.default_rng(seed).permutation(len(points_world_m))  # OpenCV's is fixed
+    order = np.random.default_rng(seed).permutation(len(points_world_m))  # OpenCV never reseeds
     found, rotation, translation, _ = cv2.solvePnPRansac(
         points_world_m[order],
         uv_px[order],
@@ -89,11 +91,7 @@ def reprojection_inliers(
     limit_px: float,
 ) -> NDArray[np.bool_]:
     """Which points (N, 3) reproject within `limit_px` of their pixels (N, 2)."""
-    points = transform_points(invert_T(T_world_camera), points_world_m)
-    visible = points[:, 2] > MIN_DEPTH_M
-    points[~visible, 2] = 1.0
-    error = np.linalg.norm(project_stereo(camera, points)[:, :2] - uv_px, axis=1)
-    return visible & (error <= limit_px)
+    return reprojection_errors(camera, T_world_camera, points_world_m, uv_px) <= limit_px
 
 
 def choose_hypothesis(
@@ -105,8 +103,9 @@ def choose_hypothesis(
 ) -> tuple[MotionHypothesis, Array, int]:
     """The candidate pose with the most reprojection inliers, its name and their number.
 
-    The paper compares constant velocity with PnP RANSAC; any number of candidates will do here,
-    the earliest wins a tie. At least one candidate must be a pose.
+    Paper, section Camera Pose Estimation, which compares constant velocity with PnP RANSAC.
+    Deviation: any number of candidates will do here. The earliest wins a tie, and at least one
+    must be a pose. points_world_m: (N, 3). uv_px: (N, 2). limit_px: error of an inlier.
     """
     scored = [
         (int(reprojection_inliers(camera, T, points_world_m, uv_px, limit_px).sum()), name, T)

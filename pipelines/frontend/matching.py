@@ -46,6 +46,16 @@ def match_in_radius(
     )
     a, b = pairs.row.astype(np.int64), pairs.col.astype(np.int64)
     distance = hamming_distance(descriptors_a[a], descriptors_b[b])
+    return mutual_best(a, b, distance, max_distance)
+
+
+def mutual_best(
+    a: Indices, b: Indices, distance: NDArray[np.int64], max_distance: int
+) -> tuple[Indices, Indices]:
+    """Of candidate pairs (N,) those in which each is the other's nearest, within `max_distance`.
+
+    Returns indices of both, equally long, in the order of the candidates; the first wins a tie.
+    """
     near = distance <= max_distance
     a, b, distance = a[near], b[near], distance[near]
     mutual = _first_per_group(a, distance) & _first_per_group(b, distance)
@@ -65,7 +75,11 @@ def _first_per_group(group: Indices, distance: NDArray[np.int64]) -> NDArray[np.
 def match_all(
     descriptors_a: Descriptors, descriptors_b: Descriptors, max_distance: int, ratio: float
 ) -> tuple[Indices, Indices]:
-    """One-to-one nearest matches of all with all, where the second best is clearly worse (Lowe)."""
+    """One-to-one nearest matches of all with all, where the second best is clearly worse (Lowe).
+
+    Descriptors (N, 32) and (M, 32). A match has at most `max_distance` bits and less than `ratio`
+    times the distance of the second best. Returns indices into both, equally long.
+    """
     none = np.empty(0, np.int64)
     if len(descriptors_a) < 2 or len(descriptors_b) < 2:
         return none, none

@@ -18,8 +18,8 @@ from pipelines.frontend.sampling import sample_bilinear
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
 from pipelines.geometry import MIN_DEPTH_M, invert_T, project_stereo, transform_points
-from pipelines.mapping.keyframe import Tracks
 from pipelines.mapping.sparse_map import SparseMap
+from pipelines.observations import Tracks
 from pipelines.types import Array
 
 _ALIGNMENT_TOLERANCE_PX = 10.0  # alignment may move a point this far from an ORB match

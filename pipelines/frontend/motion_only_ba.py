@@ -1,6 +1,9 @@
 """Motion-only bundle adjustment: one camera pose from stereo pixels of known points.
 
 Owns eq. (1) of the paper, its weights and its robust minimisation. Knows no images and no map.
+
+Deviation: the paper weighs all observations alike and sees one pixel (u_L, v) a point. Here each
+weighs by its noise and its point's covariance, and close points are seen by the right camera too.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from pipelines.geometry import (
     projection_jacobian,
     transform_points,
 )
+from pipelines.observations import StereoObservations
 from pipelines.types import Array, StereoCamera
 
 CHI2_95_2DOF = 5.991  # chi-square, 95 %, of a pixel (u_L, v)
@@ -27,35 +31,6 @@ _MAX_NOISE_FACTOR = 2.0  # a frame may be this much noisier than the ones before
 _MIN_POINTS = 6  # fewer cannot be told from an accident
 _MAX_ITERATIONS = 10  # Levenberg-Marquardt steps per round
 _CONVERGED_SIGMAS = 0.01  # a step this small beside the pose's standard deviation ends a round
-
-
-@dataclass(frozen=True, slots=True)
-class StereoObservations:
-    """Points of the map and where an image sees them (parallel arrays of length N).
-
-    points_world_m: (N, 3). point_covariances_m2: (N, 3, 3), in the world, zero if exact.
-    uvr_px: (N, 3) stereo pixels u_L, v, u_R; u_R is NaN where the depth is not known or far.
-    sigma_uv_px, sigma_disparity_px: (N,) standard deviations of the pixel and of u_L - u_R.
-    """
-
-    points_world_m: Array
-    point_covariances_m2: Array
-    uvr_px: Array
-    sigma_uv_px: Array
-    sigma_disparity_px: Array
-
-    def __len__(self) -> int:
-        return len(self.uvr_px)
-
-    def __getitem__(self, which: NDArray) -> StereoObservations:
-        """The observations chosen by a boolean mask or an index array."""
-        return StereoObservations(
-            self.points_world_m[which],
-            self.point_covariances_m2[which],
-            self.uvr_px[which],
-            self.sigma_uv_px[which],
-            self.sigma_disparity_px[which],
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,12 +90,20 @@ def observation_covariance(
 ) -> Array:
     """Covariances (N, 3, 3) of the residuals of eq. (1), in (u_L, v, u_R), square px.
 
-    Pixel noise plus the point's covariance seen through the projection. The disparity is measured
-    on its own, so u_R = u_L - d shares the noise of u_L.
+    Pixel noise plus the point's covariance seen through the projection.
     """
     points = transform_points(invert_T(T_world_camera), observations.points_world_m)
     J = projection_jacobian(camera, points) @ T_world_camera[:3, :3].T
     S = J @ observations.point_covariances_m2 @ J.transpose(0, 2, 1)
+    return add_pixel_noise(S, observations)
+
+
+def add_pixel_noise(covariances: Array, observations: StereoObservations) -> Array:
+    """Covariances (N, 3, 3) of (u_L, v, u_R), square px, plus the noise of the measured pixels.
+
+    The disparity d is measured on its own, so u_R = u_L - d shares the noise of u_L.
+    """
+    S = covariances.copy()
     variance = observations.sigma_uv_px**2
     for row, column in ((0, 0), (1, 1), (0, 2), (2, 0), (2, 2)):
         S[:, row, column] += variance
@@ -129,7 +112,7 @@ def observation_covariance(
 
 
 def whitening(covariances: Array) -> Array:
-    """Lower triangular W (N, 3, 3) with W S W^T = I, by Cholesky in closed form.
+    """Lower triangular W (N, 3, 3) with W S W^T = I of `covariances` S, by Cholesky, closed form.
 
     Not finite where S is not positive definite in double precision.
     """
@@ -247,7 +230,7 @@ class _Problem:
         return weighted @ J.reshape(6, -1).T, weighted @ np.concatenate(e)
 
     def minimise(self, T: Array, used: NDArray[np.bool_], robust: bool) -> Array:
-        """Levenberg-Marquardt from `T` with a fixed set of observations."""
+        """Levenberg-Marquardt (paper) from `T` (4, 4) with a fixed set of observations."""
         damping = 1e-6
         cost = self.cost(T, used, robust)
         H, g = self.normal_equations(T, used, robust)

@@ -20,7 +20,10 @@ _MIN_DISPARITY_SIGMAS = 3.0  # nor when it is within this many standard deviatio
 
 
 class Sensor:
-    """One stereo or RGB-D camera, as well as it is known by now."""
+    """One stereo or RGB-D camera, as well as it is known by now.
+
+    noise, offset: what is learned; `LocalMapping` and `Tracker` teach it.
+    """
 
     def __init__(self, camera: StereoCamera, config: DepthConfig) -> None:
         self.camera, self.config = camera, config
@@ -30,8 +33,13 @@ class Sensor:
             self.noise.sigma_disparity_px = _DEPTH_SENSOR_SIGMA * camera.bf
 
     @property
+    def calibrates_disparity(self) -> bool:
+        """Whether the offset of the disparities is learned: a depth sensor has no disparities."""
+        return self.config.calibrate_disparity and not self.camera.is_rgbd
+
+    @property
     def min_close_disparity_px(self) -> float:
-        """Disparity above which a point counts as close.
+        """Disparity from which on a point counts as close.
 
         The paper's rule is z < 40 baselines. Deviation: depths whose relative error is measured to
         be below `relative_error` are close as well, and for a depth sensor that alone counts, as
@@ -46,7 +54,7 @@ class Sensor:
 
     @property
     def min_disparity_px(self) -> float:
-        """Disparity below which it does not even give a far point its first guess."""
+        """Disparity below which it does not even give a far point its first guess of depth."""
         sigma = self.noise.sigma_disparity_px
         return min(
             max(_MIN_DISPARITY_PX, _MIN_DISPARITY_SIGMAS * sigma), self.min_close_disparity_px

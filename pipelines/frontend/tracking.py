@@ -32,8 +32,8 @@ from pipelines.frontend.rgbd_odometry import estimate_rgbd_odometry
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
 from pipelines.geometry import MIN_DEPTH_M, invert_T, project_stereo, transform_points
-from pipelines.mapping.keyframe import Tracks
 from pipelines.mapping.sparse_map import SparseMap
+from pipelines.observations import Tracks
 from pipelines.types import Array, MotionHypothesis, TrackingStatus
 
 _RELOCALISED_SHARE = 0.5  # of descriptor matches that must agree with a pose found by them

@@ -5,54 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.config import MappingConfig
+from pipelines.observations import Tracks
 from pipelines.types import Array, Features
-
-
-@dataclass(frozen=True, slots=True)
-class Tracks:
-    """Map points seen in one image (parallel arrays of length N).
-
-    point_ids: (N,) int64. uv_px: (N, 2) sub-pixel places. disparity_px: (N,), NaN where unknown
-    or far. sigma_uv_px: (N,) standard deviations of the places.
-    """
-
-    point_ids: NDArray[np.int64]
-    uv_px: Array
-    disparity_px: Array
-    sigma_uv_px: Array
-
-    def __len__(self) -> int:
-        return len(self.point_ids)
-
-    def __getitem__(self, which: NDArray) -> Tracks:
-        """The tracks chosen by a boolean mask or an index array."""
-        return Tracks(
-            self.point_ids[which],
-            self.uv_px[which],
-            self.disparity_px[which],
-            self.sigma_uv_px[which],
-        )
-
-    @property
-    def uvr_px(self) -> Array:
-        """(N, 3) stereo pixels u_L, v, u_R."""
-        return np.column_stack([self.uv_px, self.uv_px[:, 0] - self.disparity_px])
-
-    @classmethod
-    def empty(cls) -> Tracks:
-        return cls(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty(0))
-
-    @classmethod
-    def concatenate(cls, *parts: Tracks) -> Tracks:
-        return cls(
-            np.concatenate([p.point_ids for p in parts]),
-            np.concatenate([p.uv_px for p in parts]),
-            np.concatenate([p.disparity_px for p in parts]),
-            np.concatenate([p.sigma_uv_px for p in parts]),
-        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipelines.config import Config
+from pipelines.config import MappingConfig, OrbConfig
+from pipelines.frontend.disparity_offset import follow_camera
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame
 from pipelines.frontend.view import View
 from pipelines.geometry import invert_T, projection_jacobian, transform_points
-from pipelines.mapping.keyframe import Keyframe, Tracks, needs_keyframe
+from pipelines.mapping.keyframe import Keyframe, needs_keyframe
 from pipelines.mapping.point_filter import make_points, refine_points
 from pipelines.mapping.sparse_map import SparseMap
 from pipelines.mapping.triangulation import (
@@ -23,20 +24,25 @@ from pipelines.mapping.triangulation import (
     match_along_epipolar_lines,
     triangulate,
 )
+from pipelines.observations import StereoObservations, Tracks
 from pipelines.types import Array, Features, StereoCamera
 
-_SIGMA_NEW_UV_PX = 0.05  # a point is by definition where it was first seen
-_FAR_RELATIVE_SIGMA = 0.5  # a far point's disparity is only a first guess, to be triangulated
+_SIGMA_NEW_UV_PX = 0.05  # px, small: a point is by definition where it was first seen
+_FAR_RELATIVE_SIGMA = 0.5  # sigma / disparity of a far point: a first guess, to be triangulated
 _TRIANGULATED_SIGMA_PX = 1.0  # px, of both pixels of a triangulated point
 
 
 class LocalMapping:
-    """Grows a `SparseMap` frame by frame."""
+    """Grows a `SparseMap` frame by frame.
 
-    def __init__(self, sensor: Sensor, config: Config) -> None:
-        self.sensor, self.config = sensor, config
+    Deviation: in the paper far points wait until they are triangulated. Here every point with some
+    depth enters at once with its covariance, which says how much to believe of it, and each view
+    refines it (`point_filter`); only what has no depth at all waits for two keyframes.
+    """
+
+    def __init__(self, sensor: Sensor, config: MappingConfig, orb: OrbConfig) -> None:
+        self.sensor, self.config, self.orb = sensor, config, orb
         self.camera = sensor.camera
-        self._calibrates = config.tracking.calibrate_disparity and not sensor.camera.is_rgbd
 
     def integrate(
         self, sparse_map: SparseMap, view: View, tracked: TrackedFrame
@@ -48,24 +54,28 @@ class LocalMapping:
         tracks = tracked.tracks[tracked.inliers]
         visible = np.union1d(tracked.visible_ids, tracked.tracks.point_ids)
         sparse_map.record_sight(visible, tracks.point_ids)
-        self._learn_offset(sparse_map, tracked, tracks, visible)
-        self._refine(sparse_map, tracked, tracks)
+        if len(tracks):
+            observations = sparse_map.observe(tracks, self.sensor.noise.sigma_disparity_px)
+            if self.sensor.calibrates_disparity:
+                self._learn_offset(sparse_map, tracked, tracks, observations, visible)
+            self._refine(sparse_map, tracked, tracks, observations)
         free = self.mappable_features(view, tracks)
-        budget = max(0, self.config.orb.n_features - len(tracks))
+        budget = max(0, self.orb.n_features - len(tracks))
         new = self._add_points(sparse_map, view, tracked.T_world_camera, free[:budget])
         tracks = Tracks.concatenate(tracks, new)
         last = sparse_map.keyframes[-1] if sparse_map.keyframes else None
-        is_keyframe = needs_keyframe(self.config.mapping, tracks, last, view.frame_index)
+        is_keyframe = needs_keyframe(self.config, tracks, last, view.frame_index)
         if is_keyframe:
             tracks = self._add_keyframe(sparse_map, view, tracked, tracks)
-        if self._calibrates:  # from the next view on: this one's disparities have the old offset
+        if self.sensor.calibrates_disparity:
+            # Last, as this view's own disparities were read with the old offset
             step_px = self.sensor.offset.step()
             sparse_map.shift_offset(np.union1d(visible, tracks.point_ids), step_px)
         sparse_map.cull_points(tracks.point_ids, visible)
         return tracks[sparse_map.alive[tracks.point_ids]], is_keyframe
 
     def mappable_features(self, view: View, tracks: Tracks) -> NDArray[np.int64]:
-        """Features with some depth, away from the tracked points; the strongest first."""
+        """Indices (N,) of features with some depth, away from the tracks; the strongest first."""
         features = view.features
         if len(features) == 0:
             return np.empty(0, np.int64)
@@ -75,9 +85,10 @@ class LocalMapping:
         return chosen[np.argsort(-features.response[chosen], kind="stable")]
 
     def _away_from(self, uv_px: Array, occupied_px: Array) -> NDArray[np.bool_]:
+        """Which pixels (N, 2) keep `min_points_apart_px` from all of the occupied ones (M, 2)."""
         if len(occupied_px) == 0:
             return np.ones(len(uv_px), bool)
-        apart = self.config.tracking.min_points_apart_px
+        apart = self.config.min_points_apart_px
         distance, _ = cKDTree(occupied_px).query(uv_px, distance_upper_bound=apart)
         return ~np.isfinite(distance)
 
@@ -86,21 +97,25 @@ class LocalMapping:
         sparse_map: SparseMap,
         tracked: TrackedFrame,
         tracks: Tracks,
+        observations: StereoObservations,
         visible: NDArray[np.int64],
     ) -> None:
-        if not self._calibrates or len(tracks) == 0:
-            return
+        """Learn the disparity offset; let the points depend on it as seen from this camera."""
         T = tracked.T_world_camera
-        observations = sparse_map.observe(tracks, self.sensor.noise.sigma_disparity_px)
         slopes = sparse_map.offset_slope[tracks.point_ids]
         pose_slope = self.sensor.offset.learn(self.camera, T, observations, slopes)
-        sparse_map.hold_camera(visible, T, pose_slope)
+        sparse_map.offset_slope[visible] += follow_camera(
+            T, sparse_map.position_m[visible], pose_slope
+        )
 
-    def _refine(self, sparse_map: SparseMap, tracked: TrackedFrame, tracks: Tracks) -> None:
-        if len(tracks) == 0:
-            return
+    def _refine(
+        self,
+        sparse_map: SparseMap,
+        tracked: TrackedFrame,
+        tracks: Tracks,
+        observations: StereoObservations,
+    ) -> None:
         ids, T = tracks.point_ids, tracked.T_world_camera
-        observations = sparse_map.observe(tracks, self.sensor.noise.sigma_disparity_px)
         points, covariances, slopes = refine_points(
             self.camera, T, tracked.covariance, observations, sparse_map.offset_slope[ids]
         )
@@ -131,7 +146,7 @@ class LocalMapping:
             _SIGMA_NEW_UV_PX,
             sigma_disparity,
         )
-        slopes = (T_world_camera[:3, 3] - points) / disparity[:, None]  # z = bf / d
+        slopes = (T_world_camera[:3, 3] - points) / disparity[:, None]  # as z = bf / d
         colors = read_colors(view, features.uv_px)
         ids = sparse_map.add_points(points, covariances, slopes, features.descriptors, colors)
         return Tracks(
@@ -165,32 +180,48 @@ class LocalMapping:
             return indices
         centres = np.stack([sparse_map.keyframes[i].T_world_camera[:3, 3] for i in indices])
         distance = np.linalg.norm(centres - T[:3, 3], axis=1)
-        shortest = self.config.mapping.min_triangulation_baselines * self.camera.baseline_m
+        shortest = self.config.min_triangulation_baselines * self.camera.baseline_m
         apart = np.flatnonzero(distance >= shortest)
         nearest = apart[np.argsort(distance[apart], kind="stable")]
-        return indices[nearest[: self.config.mapping.triangulate_with]]
+        return indices[nearest[: self.config.triangulate_with]]
 
     def _triangulate_with(
         self, sparse_map: SparseMap, other: Keyframe, view: View, T: Array, free: Features
     ) -> tuple[Tracks, NDArray[np.bool_]]:
-        """Points from the free features of this frame and of one keyframe."""
-        config = self.config.mapping
+        """Points from the free features of this frame and of one keyframe.
+
+        Returns their tracks in this frame, and which of the features (N,) they took.
+        """
         used = np.zeros(len(free), bool)
         T_curr_other = invert_T(T) @ other.T_world_camera
         i, j = match_along_epipolar_lines(
-            self.camera, T_curr_other, free, other.free_features, config.max_epipolar_px
+            self.camera,
+            T_curr_other,
+            free,
+            other.free_features,
+            self.config.max_epipolar_px,
+            self.orb.scale_factor,
         )
         if len(i) == 0:
             return Tracks.empty(), used
         a, b = free[i], other.free_features[j]
         points = triangulate(self.camera, T, other.T_world_camera, a.uv_px, b.uv_px)
-        good = check_triangulated(self.camera, T, other.T_world_camera, points, a, b, config)
+        good = check_triangulated(
+            self.camera,
+            T,
+            other.T_world_camera,
+            points,
+            a,
+            b,
+            self.config,
+            self.orb.scale_factor,
+        )
         points, a = points[good], a[good]
         used[i[good]] = True
         ids = sparse_map.add_points(
             points,
             triangulation_covariance(self.camera, T, other.T_world_camera, points),
-            np.zeros_like(points),
+            np.zeros_like(points),  # no disparity went into them
             a.descriptors,
             read_colors(view, a.uv_px),
         )
@@ -201,13 +232,13 @@ class LocalMapping:
 def triangulation_covariance(
     camera: StereoCamera, T_world_a: Array, T_world_b: Array, points_world_m: Array
 ) -> Array:
-    """Covariances (N, 3, 3) of two-view points, from the pixel noise in both images."""
+    """Covariances (N, 3, 3) in the world, in m^2, of two-view points (N, 3), from pixel noise."""
     information = np.zeros((len(points_world_m), 3, 3))
     for T in (T_world_a, T_world_b):
         points = transform_points(invert_T(T), points_world_m)
         J = projection_jacobian(camera, points)[:, :2] @ T[:3, :3].T
         information += J.transpose(0, 2, 1) @ J / _TRIANGULATED_SIGMA_PX**2
-    return np.linalg.inv(information + 1e-6 * np.eye(3))
+    return np.linalg.inv(information + 1e-6 * np.eye(3))  # along a ray nothing may be known
 
 
 def read_colors(view: View, uv_px: Array) -> NDArray[np.uint8]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.frontend.motion_only_ba import StereoObservations
+from pipelines.frontend.motion_only_ba import add_pixel_noise
 from pipelines.geometry import (
     backproject,
     invert_T,
@@ -17,6 +17,7 @@ from pipelines.geometry import (
     projection_jacobian,
     transform_points,
 )
+from pipelines.observations import StereoObservations
 from pipelines.types import Array, StereoCamera
 
 _MAX_DEPTH_FACTOR = 3.0  # one update may change a depth at most by this factor
@@ -25,7 +26,10 @@ _MAX_DEPTH_FACTOR = 3.0  # one update may change a depth at most by this factor
 def backprojection_covariance(
     camera: StereoCamera, points_camera: Array, sigma_uv_px: Array, sigma_disparity_px: Array
 ) -> Array:
-    """Covariances (N, 3, 3) in the camera of points (N, 3) seen at a pixel with a disparity."""
+    """Covariances (N, 3, 3) in the camera, in m^2, of points (N, 3) from a pixel and a disparity.
+
+    sigma_uv_px, sigma_disparity_px: (N,) standard deviations of these.
+    """
     z = points_camera[:, 2]
     J = np.zeros((len(z), 3, 3))
     J[:, 0, 0], J[:, 1, 1] = z / camera.fx, z / camera.fy
@@ -42,7 +46,10 @@ def make_points(
     sigma_uv_px: float,
     sigma_disparity_px: Array,
 ) -> tuple[Array, Array]:
-    """World points (N, 3) and covariances (N, 3, 3) from pixels (N, 2) and disparities (N,)."""
+    """World points (N, 3) and covariances (N, 3, 3) from pixels (N, 2) and disparities (N,).
+
+    sigma_uv_px: of all pixels, sigma_disparity_px: (N,). The pose is taken as exact.
+    """
     points = backproject(camera, uv_px, camera.bf / disparity_px)
     sigma_uv = np.full(len(points), sigma_uv_px)
     covariance = backprojection_covariance(camera, points, sigma_uv, sigma_disparity_px)
@@ -55,13 +62,15 @@ def refine_points(
     T_world_camera: Array,
     pose_covariance: Array,
     observations: StereoObservations,
-    sensitivities: Array,
+    offset_slopes: Array,
 ) -> tuple[Array, Array, Array]:
-    """Points (N, 3), covariances (N, 3, 3) and sensitivities (N, 3) after one image.
+    """World points (N, 3), covariances (N, 3, 3) and offset slopes (N, 3) after one image.
 
     The pose's covariance (6, 6) counts as observation noise, so that a poor pose moves no point.
-    All points must lie in front of the camera. sensitivities: (N, 3) d(point in the world) /
-    d(disparity offset), which follow the points through the update.
+    All points must lie in front of the camera. offset_slopes: (N, 3) d(point in the world) /
+    d(disparity offset), m / px, which follow the points through the update.
+
+    Deviation: the paper does not say how points come by their places after triangulation.
     """
     R = T_world_camera[:3, :3]
     points = transform_points(invert_T(T_world_camera), observations.points_world_m)
@@ -70,14 +79,10 @@ def refine_points(
     J_point = D @ R.T
     residual = observations.uvr_px - project_stereo(camera, points)
     mono = np.isnan(residual[:, 2])
-    slope = -np.einsum("nij,nj->ni", J_point, sensitivities)  # d residual / d offset
+    slope = -np.einsum("nij,nj->ni", J_point, offset_slopes)  # d residual / d offset
     slope[:, 2] -= 1.0
     residual[mono, 2] = slope[mono, 2] = 0.0
-    S = J_pose @ pose_covariance @ J_pose.transpose(0, 2, 1)
-    variance = observations.sigma_uv_px**2
-    for row, column in ((0, 0), (1, 1), (0, 2), (2, 0), (2, 2)):
-        S[:, row, column] += variance
-    S[:, 2, 2] += observations.sigma_disparity_px**2
+    S = add_pixel_noise(J_pose @ pose_covariance @ J_pose.transpose(0, 2, 1), observations)
     P = observations.point_covariances_m2
     J_point[mono, 2, :] = 0.0
     S[mono, 2, :] = 0.0
@@ -91,7 +96,7 @@ def refine_points(
     M = R @ M @ R.T
     P_new = M @ P_new @ M.transpose(0, 2, 1)
     P_new = 0.5 * (P_new + P_new.transpose(0, 2, 1))
-    slope_new = sensitivities + np.einsum("nij,nj->ni", gain, slope)
+    slope_new = offset_slopes + np.einsum("nij,nj->ni", gain, slope)
     slope_new = np.einsum("nij,nj->ni", M, slope_new)
     return transform_points(T_world_camera, moved), P_new, slope_new
 

@@ -10,17 +10,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import MappingConfig
-from pipelines.frontend.disparity_offset import follow_camera
-from pipelines.frontend.motion_only_ba import StereoObservations
-from pipelines.geometry import invert_T, project_stereo, transform_points
-from pipelines.mapping.keyframe import Keyframe, Tracks
+from pipelines.geometry import (
+    MIN_DEPTH_M,
+    inside_image,
+    invert_T,
+    project_stereo,
+    transform_points,
+)
+from pipelines.mapping.keyframe import Keyframe
+from pipelines.observations import StereoObservations, Tracks
 from pipelines.types import Array, StaticMap, StereoCamera
 
 Ids = NDArray[np.int64]
 
+_FIRST_CAPACITY = 4096  # rows; doubled whenever they are full
+_MIN_CHANCES = 8  # frames that should have seen a point before its found ratio counts
+_NEIGHBOURS = 5  # covisible keyframes that each keyframe brings into the local map
+_SAME_DIRECTION_DEG = 40.0  # optical axes closer than this look at the same things
+
 _COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {
     "position_m": ((3,), np.float64),  # in the world
-    "covariance_m2": ((3, 3), np.float64),
+    "covariance_m2": ((3, 3), np.float64),  # in the world
     "offset_slope": ((3,), np.float64),  # d position / d disparity offset, m / px
     "descriptor": ((32,), np.uint8),
     "color": ((3,), np.uint8),
@@ -60,7 +70,7 @@ class SparseMap:
         self._young = np.empty(0, np.int64)  # points that no keyframe has seen yet
         self._keyframe_Ts = np.empty((0, 4, 4))
         for name, (shape, dtype) in _COLUMNS.items():
-            setattr(self, name, np.zeros((4096, *shape), dtype))
+            setattr(self, name, np.zeros((_FIRST_CAPACITY, *shape), dtype))
 
     # ---------------------------------------------------------------- points
 
@@ -72,7 +82,11 @@ class SparseMap:
         descriptors: NDArray[np.uint8],
         colors: NDArray[np.uint8],
     ) -> Ids:
-        """Store new points, seen once so far, and return their ids (N,)."""
+        """Store new points, seen once so far, and return their ids (N,).
+
+        points_world_m: (N, 3). covariances_m2: (N, 3, 3) in the world. offset_slopes: (N, 3)
+        d(point) / d(disparity offset), m / px. descriptors: (N, 32). colors: (N, 3) RGB.
+        """
         ids = self._allocate(len(points_world_m))
         self.position_m[ids] = points_world_m
         self.covariance_m2[ids] = covariances_m2
@@ -102,7 +116,7 @@ class SparseMap:
         return ids
 
     def observe(self, tracks: Tracks, sigma_disparity_px: float) -> StereoObservations:
-        """The observations that the tracks make of their points."""
+        """The tracks with their points as the map has them, all with one noise of disparity."""
         ids = tracks.point_ids
         return StereoObservations(
             self.position_m[ids],
@@ -112,12 +126,8 @@ class SparseMap:
             np.full(len(ids), sigma_disparity_px),
         )
 
-    def hold_camera(self, ids: Ids, T_world_camera: Array, pose_slope: Array) -> None:
-        """Let points depend on the disparity offset as seen with the present camera held still."""
-        self.offset_slope[ids] += follow_camera(T_world_camera, self.position_m[ids], pose_slope)
-
     def shift_offset(self, ids: Ids, step_px: float) -> None:
-        """Let points follow a new disparity offset."""
+        """Let points follow a change of the disparity offset, to first order."""
         self.position_m[ids] += step_px * self.offset_slope[ids]
 
     def record_sight(self, visible_ids: Ids, found_ids: Ids) -> None:
@@ -134,7 +144,7 @@ class SparseMap:
         tracked[tracked_ids] = True
         self._young = self._young[self.n_keyframes[self._young] == 0]
         ratio = self.n_found[visible_ids] / np.maximum(self.n_visible[visible_ids], 1)
-        poor = (self.n_visible[visible_ids] >= 8) & (ratio < self.config.min_found_ratio)
+        poor = (self.n_visible[visible_ids] >= _MIN_CHANCES) & (ratio < self.config.min_found_ratio)
         broken = tracked_ids[~np.isfinite(self.position_m[tracked_ids]).all(axis=1)]
         doomed = np.concatenate([self._young, visible_ids[poor]])
         doomed = np.unique(np.concatenate([doomed[~tracked[doomed]], broken]))
@@ -169,12 +179,15 @@ class SparseMap:
         self._keyframe_Ts = np.concatenate([self._keyframe_Ts, keyframe.T_world_camera[None]])
 
     def covisible_keyframes(self, index: int) -> Ids:
-        """Positions in `keyframes` of those that share points with keyframe `index`."""
+        """Positions in `keyframes` of those covisible with keyframe `index`, most shared first."""
         return self._covisible[index]
 
     def local_keyframes(self, point_ids: Ids, T_world_camera: Array) -> Ids:
-        """Keyframes that may see these points: their first observers, those's neighbours, and
-        keyframes near in place and direction, which is where a path crosses itself."""
+        """Positions in `keyframes` of those that may see these points, in ascending order.
+
+        They are the points' first observers, the neighbours of these by covisibility, the latest,
+        and those near in place and direction, which is where a path crosses itself.
+        """
         if not self.keyframes:
             return np.empty(0, np.int64)
         first = self.first_keyframe[point_ids]
@@ -182,7 +195,7 @@ class SparseMap:
         chosen = np.argsort(-votes, kind="stable")[: self.config.local_keyframes]
         chosen = chosen[votes[chosen] > 0]
         chosen = np.union1d(chosen, [len(self.keyframes) - 1])
-        neighbours = [self._covisible[k][:5] for k in chosen if k < len(self._covisible)]
+        neighbours = [self.covisible_keyframes(k)[:_NEIGHBOURS] for k in chosen]
         near = self._near_keyframes(T_world_camera)
         return np.unique(np.concatenate([chosen, near, *neighbours])).astype(np.int64)
 
@@ -192,7 +205,8 @@ class SparseMap:
         distance = np.linalg.norm(Ts[:, :3, 3] - T_world_camera[:3, 3], axis=1)
         cosine = Ts[:, :3, 2] @ T_world_camera[:3, 2]
         reach = self.config.near_keyframe_baselines * self.camera.baseline_m
-        near = np.flatnonzero((distance < reach) & (cosine > np.cos(np.radians(40.0))))
+        alike = cosine > np.cos(np.radians(_SAME_DIRECTION_DEG))
+        near = np.flatnonzero((distance < reach) & alike)
         return near[np.argsort(distance[near], kind="stable")[: self.config.local_keyframes]]
 
     def local_points(self, T_world_camera: Array, tracked_ids: Ids) -> tuple[Ids, Array]:
@@ -205,15 +219,10 @@ class SparseMap:
         flags[tracked_ids] = False
         ids = np.flatnonzero(flags)
         points = transform_points(invert_T(T_world_camera), self.position_m[ids])
-        front = points[:, 2] > 0.1
+        front = points[:, 2] > MIN_DEPTH_M
         ids, points = ids[front], points[front]
         uv = project_stereo(self.camera, points)[:, :2]
-        inside = (
-            (uv[:, 0] > 0)
-            & (uv[:, 1] > 0)
-            & (uv[:, 0] < self.camera.width - 1)
-            & (uv[:, 1] < self.camera.height - 1)
-        )
+        inside = inside_image(self.camera, uv)
         return ids[inside], uv[inside]
 
     # --------------------------------------------------------------- outside

@@ -10,9 +10,9 @@ from pipelines.config import MappingConfig
 from pipelines.frontend.disparity_offset import DisparityOffset, follow_camera
 from pipelines.frontend.motion_only_ba import estimate_camera_pose
 from pipelines.geometry import exp_se3, inside_image, invert_T, project_stereo, transform_points
-from pipelines.mapping.keyframe import Tracks
 from pipelines.mapping.point_filter import make_points, refine_points
 from pipelines.mapping.sparse_map import SparseMap
+from pipelines.observations import Tracks
 from pipelines.types import StereoCamera
 
 CAMERA = StereoCamera(1242, 375, 721.5, 721.5, 609.6, 172.9, 387.6)
@@ -65,7 +65,7 @@ class Drive:
         T, kept = estimate.T_world_camera, estimate.inliers
         rows, slopes = rows[kept], self.map.offset_slope[rows[kept]]
         pose_slope = self.offset.learn(CAMERA, T, observations[kept], slopes)
-        self.map.hold_camera(rows, T, pose_slope)
+        self.map.offset_slope[rows] += follow_camera(T, self.map.position_m[rows], pose_slope)
         observations = self.map.observe(tracks[kept], SIGMA_DISPARITY_PX)
         points, covariances, slopes = refine_points(
             CAMERA, T, estimate.covariance, observations, self.map.offset_slope[rows]
@@ -142,3 +142,10 @@ def test_points_that_follow_the_camera_stay_where_it_sees_them():
     np.testing.assert_allclose(
         follow_camera(T, points, slope), (carried - points) / h, rtol=1e-4, atol=1e-3
     )
+
+
+def test_a_shift_of_the_camera_is_handed_to_the_points_the_other_way():
+    points = np.random.default_rng(5).uniform([-3, -2, 4], [3, 2, 20], (20, 3))
+    shift = np.array([0.3, -0.2, 0.5])
+    slopes = follow_camera(np.eye(4), points, np.r_[0.0, 0.0, 0.0, shift])
+    np.testing.assert_allclose(slopes, np.tile(-shift, (20, 1)))

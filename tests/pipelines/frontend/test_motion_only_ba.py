@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from pipelines.frontend.motion_only_ba import (
     CHI2_95_2DOF,
     CHI2_95_3DOF,
-    StereoObservations,
     estimate_camera_pose,
     observation_covariance,
     whitening,
@@ -22,6 +21,7 @@ from pipelines.geometry import (
     rotation_angle_deg,
     transform_points,
 )
+from pipelines.observations import StereoObservations
 from pipelines.types import StereoCamera
 
 CAMERA = StereoCamera(1242, 375, 721.5, 721.5, 609.6, 172.9, 387.6)

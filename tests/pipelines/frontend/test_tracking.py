@@ -11,9 +11,9 @@ from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame, Tracker
 from pipelines.frontend.view import make_view
 from pipelines.geometry import exp_se3, invert_T, rotation_angle_deg
-from pipelines.mapping.keyframe import Tracks
 from pipelines.mapping.local_mapping import LocalMapping
 from pipelines.mapping.sparse_map import SparseMap
+from pipelines.observations import Tracks
 from pipelines.types import Frame, MotionHypothesis, StereoCamera, TrackingStatus
 
 CAMERA = StereoCamera(400, 240, 260.0, 260.0, 199.5, 119.5, 78.0)
@@ -72,7 +72,7 @@ class Run:
         self.sensor = Sensor(CAMERA, config.depth)
         self.tracker = Tracker(self.sensor, config.tracking)
         self.map = SparseMap(CAMERA, config.mapping)
-        self.mapping = LocalMapping(self.sensor, config)
+        self.mapping = LocalMapping(self.sensor, config.mapping, config.orb)
         self.orb = OrbExtractor(config.orb)
         self.last_world = None
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pipelines.config import MappingConfig
-from pipelines.mapping.keyframe import Keyframe, Tracks, needs_keyframe
+from pipelines.mapping.keyframe import Keyframe, needs_keyframe
+from pipelines.observations import Tracks
 from pipelines.types import Features
 
 CONFIG = MappingConfig(keyframe_min_overlap=0.7, keyframe_max_interval=10)

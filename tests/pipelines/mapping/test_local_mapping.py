@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipelines.config import Config, MappingConfig, OrbConfig, TrackingConfig
+from pipelines.config import Config, DepthConfig, MappingConfig, OrbConfig
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame
 from pipelines.frontend.view import View
@@ -16,10 +16,10 @@ from pipelines.geometry import (
     project_stereo,
     transform_points,
 )
-from pipelines.mapping.keyframe import Tracks
 from pipelines.mapping.local_mapping import LocalMapping, read_colors, triangulation_covariance
 from pipelines.mapping.sparse_map import SparseMap
 from pipelines.mapping.triangulation import triangulate
+from pipelines.observations import Tracks
 from pipelines.types import Features, MotionHypothesis, StereoCamera, TrackingStatus
 
 CAMERA = StereoCamera(640, 400, 500.0, 500.0, 320.0, 200.0, 250.0)  # half a metre of baseline
@@ -29,7 +29,7 @@ SIGMA_UV_PX, SIGMA_DISPARITY_PX = 0.2, 0.3
 def settings(n_features=600, **mapping):
     return Config(
         orb=OrbConfig(n_features=n_features),
-        tracking=TrackingConfig(calibrate_disparity=False),
+        depth=DepthConfig(calibrate_disparity=False),
         mapping=MappingConfig(**mapping),
     )
 
@@ -47,7 +47,7 @@ class World:
         self.response = self.rng.permutation(n).astype(np.float32)
         self.sensor = Sensor(CAMERA, config.depth)
         self.sensor.noise.sigma_disparity_px = SIGMA_DISPARITY_PX
-        self.mapping = LocalMapping(self.sensor, config)
+        self.mapping = LocalMapping(self.sensor, config.mapping, config.orb)
         self.map = SparseMap(CAMERA, config.mapping)
         self.row_of = np.full(n, -1)
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from pipelines.frontend.motion_only_ba import StereoObservations
 from pipelines.geometry import (
     backproject,
     exp_se3,
@@ -13,6 +12,7 @@ from pipelines.geometry import (
     transform_points,
 )
 from pipelines.mapping.point_filter import backprojection_covariance, make_points, refine_points
+from pipelines.observations import StereoObservations
 from pipelines.types import StereoCamera
 
 CAMERA = StereoCamera(1242, 375, 721.5, 721.5, 609.6, 172.9, 387.6)

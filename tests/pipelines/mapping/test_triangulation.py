@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.config import MappingConfig
+from pipelines.config import MappingConfig, OrbConfig
 from pipelines.geometry import (
     backproject,
     exp_se3,
@@ -14,6 +14,7 @@ from pipelines.geometry import (
     project_stereo,
     transform_points,
 )
+from pipelines.mapping import triangulation
 from pipelines.mapping.triangulation import (
     check_triangulated,
     match_along_epipolar_lines,
@@ -23,6 +24,7 @@ from pipelines.types import Features, StereoCamera
 
 CAMERA = StereoCamera(640, 480, 500.0, 500.0, 320.0, 240.0, 50.0)
 CONFIG = MappingConfig()
+SCALE = OrbConfig().scale_factor
 T_A = exp_se3(np.array([0.1, -0.2, 0.05, 1.0, 2.0, 3.0]))
 T_B = T_A @ exp_se3(np.array([0.02, -0.06, 0.01, 0.9, 0.1, 0.3]))
 
@@ -56,7 +58,7 @@ def pixels(T, points):
 
 
 def check(points, a, b, T_a=T_A, T_b=T_B):
-    return check_triangulated(CAMERA, T_a, T_b, points, a, b, CONFIG)
+    return check_triangulated(CAMERA, T_a, T_b, points, a, b, CONFIG, SCALE)
 
 
 def test_exact_pixels_give_exact_points():
@@ -162,7 +164,7 @@ T_A_B = invert_T(T_A) @ T_B
 
 def test_epipolar_matches_are_the_right_ones():
     a, b, truth = epipolar_pair()
-    i, j = match_along_epipolar_lines(CAMERA, T_A_B, a, b, 1.5)
+    i, j = match_along_epipolar_lines(CAMERA, T_A_B, a, b, 1.5, SCALE)
     assert len(i) > 0.97 * len(a)
     np.testing.assert_array_equal(truth[i], j)
 
@@ -170,32 +172,52 @@ def test_epipolar_matches_are_the_right_ones():
 def test_equal_descriptors_off_the_line_do_not_match():
     a, b, truth = epipolar_pair()
     moved = replace(b, uv_px=np.add(b.uv_px, [0.0, 12.0]))
-    i, _ = match_along_epipolar_lines(CAMERA, T_A_B, a, moved, 1.5)
+    i, _ = match_along_epipolar_lines(CAMERA, T_A_B, a, moved, 1.5, SCALE)
     assert len(i) < 0.05 * len(a)
-    i, j = match_along_epipolar_lines(CAMERA, T_A_B, a, moved, 14.0)
+    i, j = match_along_epipolar_lines(CAMERA, T_A_B, a, moved, 14.0, SCALE)
     assert len(i) > 0.9 * len(a) and (truth[i] == j).all()
 
 
 def test_epipolar_matches_are_one_to_one_and_alike():
     a, b, _ = epipolar_pair()
     alike = replace(a, descriptors=np.repeat(a.descriptors[:1], len(a), 0))
-    i, j = match_along_epipolar_lines(CAMERA, T_A_B, alike, alike, 1e3)
+    i, j = match_along_epipolar_lines(CAMERA, T_A_B, alike, alike, 1e3, SCALE)
     assert len(i) >= 1
     assert len(np.unique(i)) == len(i) and len(np.unique(j)) == len(j)
     strangers = replace(b, descriptors=features_at(b.uv_px, seed=99).descriptors)
-    assert len(match_along_epipolar_lines(CAMERA, T_A_B, a, strangers, 1e3)[0]) == 0
+    assert len(match_along_epipolar_lines(CAMERA, T_A_B, a, strangers, 1e3, SCALE)[0]) == 0
 
 
 def test_epipolar_matches_are_of_about_the_same_scale():
     a, b, _ = epipolar_pair()
     for octave, found in ((1, True), (2, False)):
         coarser = replace(b, octave=np.full(len(b), octave, np.int32))
-        i, _ = match_along_epipolar_lines(CAMERA, T_A_B, a, coarser, 1.5)
+        i, _ = match_along_epipolar_lines(CAMERA, T_A_B, a, coarser, 1.5, SCALE)
         assert (len(i) > 100) is found
 
 
 @pytest.mark.parametrize(("n", "m"), [(0, 10), (10, 0), (0, 0)])
 def test_nothing_to_match(n, m):
     a, b, _ = epipolar_pair(10)
-    i, j = match_along_epipolar_lines(CAMERA, T_A_B, a[np.arange(n)], b[np.arange(m)], 1.5)
+    i, j = match_along_epipolar_lines(CAMERA, T_A_B, a[np.arange(n)], b[np.arange(m)], 1.5, SCALE)
     assert len(i) == len(j) == 0
+
+
+def test_more_features_than_fit_in_memory_at_a_time_are_matched_alike(monkeypatch):
+    _, uv_a, uv_b = scene(300)
+    a, b = features_at(uv_a), features_at(uv_b)
+    T_A_B = invert_T(T_A) @ T_B
+    whole = match_along_epipolar_lines(CAMERA, T_A_B, a, b, 1.5, SCALE)
+    assert len(whole[0]) > 290
+    for pairs in (1, 7 * len(b), len(a) * len(b) - 1):
+        monkeypatch.setattr(triangulation, "_PAIRS_AT_A_TIME", pairs)
+        parts = match_along_epipolar_lines(CAMERA, T_A_B, a, b, 1.5, SCALE)
+        np.testing.assert_array_equal(parts, whole)
+
+
+def test_the_limits_grow_with_the_scale_factor_of_the_pyramid():
+    points, uv_a, uv_b = scene()
+    a, shifted = features_at(uv_a, octave=2), features_at(np.add(uv_b, [0.0, 3.5]), octave=2)
+    for scale_factor, passes in ((1.2, False), (1.5, True)):
+        good = check_triangulated(CAMERA, T_A, T_B, points, a, shifted, CONFIG, scale_factor)
+        assert good.all() if passes else not good.any()
