@@ -18,10 +18,12 @@ MAX_DEPTH_M = 1000.0  # a disparity that says more than this is noise about zero
 SGBM_SCALE = 16.0  # OpenCV's fixed point: its disparities are steps of 1/16 px
 HALF_SIZE_ERROR_PX = 0.5  # of disparities matched at half size, granted on top of the check
 SLOPE_PX = 0.75  # neighbours within this are one surface, whose steps of 1/16 px are averaged out
-WINDOW_PX = 7  # side of the patches that the dense refinement compares
+HALF_SIZE_WINDOW_PX = 5  # side, at half size, of the patches that the dense refinement compares
 MIN_CORRELATION = 0.2  # of the two views' patches; asphalt has more, a clear sky has none
 MAX_STEP_PX = 0.5  # a refinement that goes farther has found something else
+ROUNDING_NOISE = 1 / 12  # (grey levels)^2, the variance that rounding alone gives a flat patch
 GRADIENT_NOISE = 4.0  # (grey levels / px)^2, keeps the step small where there is no texture
+TINY = np.float32(1e-6)  # keeps divisors off zero
 
 POINT_WINDOW_PX = 5  # half size of the patch that a single point is refined on
 POINT_SIGMA_PX = 3.0  # its weights fall off towards depth edges that may cross the patch
@@ -49,6 +51,10 @@ class StereoDepth:
         self._right_matcher = _make_matcher(self._half_search_px, block)
         v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
         self._u, self._v = u, v
+        half_width, half_height = _half_size(camera.width), _half_size(camera.height)
+        self._half_u_scale = half_width / camera.width
+        self._half_u = (u + 0.5) * self._half_u_scale - 0.5
+        self._half_v = (v + 0.5) * (half_height / camera.height) - 0.5
 
     def compute(self, image: Image, image_right: Image) -> NDArray[np.float32]:
         """Depth (H, W) float32 in metres registered to `image`, NaN unknown.
@@ -74,7 +80,7 @@ class StereoDepth:
         disparity = _match(self._matcher, left, right, self._search_px)
         known = self._agrees_with_right(disparity, left, right)
         disparity, alike = self._refine(disparity, known, left, right)
-        disparity[~(known & alike)] = np.nan
+        np.putmask(disparity, ~(known & alike), np.float32(np.nan))
         return disparity
 
     def _agrees_with_right(
@@ -85,19 +91,17 @@ class StereoDepth:
         mirrored = _match(
             self._right_matcher, _half_mirrored(right), _half_mirrored(left), self._half_search_px
         )
-        from_right = np.ascontiguousarray(2 * mirrored[:, ::-1])
-        scale_u = from_right.shape[1] / self._camera.width
-        scale_v = from_right.shape[0] / self._camera.height
-        there = cv2.remap(
-            from_right,
-            (self._u - disparity + 0.5) * scale_u - 0.5,
-            (self._v + 0.5) * scale_v - 0.5,
+        there = 2 * cv2.remap(
+            cv2.flip(mirrored, 1),
+            cv2.scaleAdd(disparity, -self._half_u_scale, self._half_u),
+            self._half_v,
             cv2.INTER_NEAREST,
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=-1.0,
         )
         tolerance = self._config.left_right_max_px + HALF_SIZE_ERROR_PX
-        return (disparity > 0) & (there > 0) & (np.abs(there - disparity) <= tolerance)
+        agrees = cv2.absdiff(there, disparity) <= tolerance
+        return agrees & (disparity > 0) & (there > 0)
 
     def _refine(
         self,
@@ -112,24 +116,27 @@ class StereoDepth:
         patches do not correlate, as in the sky, its smoothness alone has made up a disparity.
         """
         weight = known.astype(np.float32)
-        count = cv2.blur(weight, (5, 5)) + np.float32(1e-6)
+        count = cv2.blur(weight, (5, 5)) + TINY
         mean = cv2.divide(cv2.blur(cv2.multiply(disparity, weight), (5, 5)), count)
-        smooth = np.where(cv2.absdiff(mean, disparity) < SLOPE_PX, mean, disparity)
+        on_surface = cv2.inRange(cv2.subtract(mean, disparity), -SLOPE_PX, SLOPE_PX)
+        smooth = cv2.copyTo(mean, on_surface, disparity.copy())
         left_f, right_f = left.astype(np.float32), right.astype(np.float32)
-        warped = cv2.remap(right_f, self._u - smooth, self._v, cv2.INTER_LINEAR)
+        warped = cv2.remap(right_f, cv2.subtract(self._u, smooth), self._v, cv2.INTER_LINEAR)
         middle = cv2.addWeighted(left_f, 0.5, warped, 0.5, 0)
         slope = cv2.multiply(cv2.Sobel(middle, cv2.CV_32F, 1, 0, scale=1 / 8), weight)
+        left_f, warped = cv2.multiply(left_f, weight), cv2.multiply(warped, weight)
+        error = cv2.subtract(warped, left_f)
         # All without their means, so that a difference in exposure does not shift disparities.
-        n = _box(weight) + np.float32(1e-6)
-        error = cv2.multiply(cv2.subtract(warped, left_f), weight)
-        covariance = _box(cv2.multiply(slope, error)) - _box(slope) / n * _box(error)
-        variance = _box(cv2.multiply(slope, slope))
-        step = cv2.divide(covariance, variance + np.float32(GRADIENT_NOISE))
-        left_f, warped = _deviation(left_f, weight, n), _deviation(warped, weight, n)
-        product = _box(cv2.multiply(left_f, warped))
-        power = cv2.multiply(_box(cv2.multiply(left_f, left_f)), _box(cv2.multiply(warped, warped)))
-        alike = (product > 0) & (cv2.multiply(product, product) > MIN_CORRELATION**2 * power)
-        return smooth + np.clip(step, -MAX_STEP_PX, MAX_STEP_PX), alike
+        n = _mean(weight) + TINY
+        variance = _mean(cv2.multiply(slope, slope)) + GRADIENT_NOISE
+        step = cv2.divide(_covariance(slope, error, n), variance)
+        power = cv2.multiply(
+            _covariance(left_f, left_f, n) + ROUNDING_NOISE,
+            _covariance(warped, warped, n) + ROUNDING_NOISE,
+        )
+        excess = _covariance(left_f, warped, n) - MIN_CORRELATION * cv2.sqrt(power)
+        step, excess = (cv2.resize(x, (left.shape[1], left.shape[0])) for x in (step, excess))
+        return cv2.add(smooth, np.clip(step, -MAX_STEP_PX, MAX_STEP_PX)), excess > 0
 
 
 def refine_disparity(
@@ -192,16 +199,19 @@ def _multiple_of_16(disparities: int) -> int:
     return max(16, -(-disparities // 16) * 16)
 
 
-def _box(image: NDArray[Any]) -> NDArray[np.float32]:
-    return np.asarray(cv2.blur(image, (WINDOW_PX, WINDOW_PX)), np.float32)
+def _mean(image: NDArray[Any]) -> NDArray[np.float32]:
+    """Mean over a window about each pixel, at half size: quicker, and it varies slowly."""
+    size = (_half_size(image.shape[1]), _half_size(image.shape[0]))
+    half = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(cv2.blur(half, (HALF_SIZE_WINDOW_PX, HALF_SIZE_WINDOW_PX)), np.float32)
 
 
-def _deviation(
-    image: NDArray[Any], weight: NDArray[np.float32], mean_weight: NDArray[np.float32]
+def _covariance(
+    a: NDArray[np.float32], b: NDArray[np.float32], n: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """`image` less the weighted mean of its neighbourhood, 0 where the weight is 0."""
-    mean = cv2.divide(_box(cv2.multiply(image, weight)), mean_weight)
-    return np.asarray(cv2.multiply(cv2.subtract(image, mean), weight), np.float32)
+    """Of `a` and `b` over the windows of `_mean`, times n, the share of known pixels in them."""
+    means = cv2.divide(cv2.multiply(_mean(a), _mean(b)), n)
+    return np.asarray(cv2.subtract(_mean(cv2.multiply(a, b)), means), np.float32)
 
 
 def _make_matcher(search_px: int, block_px: int) -> cv2.StereoSGBM:
@@ -228,15 +238,19 @@ def _match(
         for image in (left, right)
     ]
     steps = matcher.compute(wide[0], wide[1])[:, search_px:]
-    disparity = steps.astype(np.float32) / np.float32(SGBM_SCALE)
-    columns = np.arange(disparity.shape[1], dtype=np.float32)
-    disparity[(disparity < 0) | (disparity > columns)] = 0
+    disparity = np.maximum(steps, 0) * np.float32(1 / SGBM_SCALE)
+    near_edge = disparity[:, :search_px]  # elsewhere no disparity leads out of the right image
+    near_edge[near_edge > np.arange(near_edge.shape[1], dtype=np.float32)] = 0
     return disparity
 
 
 def _half_mirrored(image: Image) -> Image:
-    half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return np.asarray(half[:, ::-1], np.uint8)
+    size = (_half_size(image.shape[1]), _half_size(image.shape[0]))
+    return np.asarray(cv2.flip(cv2.resize(image, size, interpolation=cv2.INTER_AREA), 1), np.uint8)
+
+
+def _half_size(size_px: int) -> int:
+    return (size_px + 1) // 2
 
 
 def _sample(image: NDArray[np.float32], u: NDArray, v: NDArray) -> NDArray[np.float32]:

@@ -126,6 +126,18 @@ def test_right_image_of_another_exposure(pair: Pair, stereo: StereoDepth) -> Non
     assert np.median(np.abs(found - pair.disparity)[seen]) < 0.1
 
 
+def test_odd_sizes_halve_as_well_as_even_ones(pair: Pair) -> None:
+    camera = StereoCamera(WIDTH - 1, HEIGHT - 1, 300.0, 300.0, 160.0, 80.0, 90.0)
+    stereo = StereoDepth(DepthConfig(sgbm_num_disparities=48), camera)
+    inside = np.s_[:-1, :-1]
+    found = stereo.disparity(pair.left[inside], pair.right[inside])
+    seen = ~pair.hidden[inside]
+    assert 0.85 < np.isfinite(found[seen]).mean() <= 1.0
+    error = np.abs(found - pair.disparity[inside])[seen & np.isfinite(found)]
+    assert 0.0 < np.median(error) < 0.06
+    assert (error > 1).mean() < 0.02
+
+
 def test_search_range_is_kept(pair: Pair) -> None:
     narrow = StereoDepth(DepthConfig(sgbm_num_disparities=16), CAMERA)
     assert np.nanmax(narrow.disparity(pair.left, pair.right)) < 17
