@@ -1,7 +1,8 @@
 """The system: a frame goes in, a result comes out.
 
 Owns the order of the steps and the state between frames. Each step is a function or a small class
-in `depth`, `frontend` and `mapping`; ground truth never comes near.
+in `depth`, `frontend` and `mapping`; ground truth never comes near. The steps have the numbers of
+the design: 2 (dense flow) comes with the sequence, 5 to 9 (moving objects) are not here yet.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class DyObSlam:
         """
         prepared = self.prepare(frame) if isinstance(frame, Frame) else frame
         self._timings_ms = dict(prepared.timings_ms)
-        # What is known of the sensor by now completes the view
+        # The noise and offset learned by now: `prepare` ran ahead and could not know them
         with self._stage("view"):
             sigma, offset = self.sensor.noise.sigma_disparity_px, self.sensor.offset.offset_px
             view = complete_view(self.camera, prepared, sigma, offset)
@@ -94,6 +95,7 @@ class DyObSlam:
     # ------------------------------------------------------------------ steps
 
     def _depth(self, frame: Frame) -> NDArray[np.float32] | None:
+        """(H, W) depth in m, given or by stereo; None where the frame has neither."""
         if frame.depth_m is not None or frame.image_right is None:
             return frame.depth_m
         if self._stereo is None:
@@ -118,7 +120,10 @@ class DyObSlam:
         return tracked
 
     def _start(self, view: View, T_world_camera: Array) -> TrackedFrame:
-        """First frame, or a new start at the predicted pose after a lost stretch."""
+        """First frame, or a new start at the predicted pose after a lost stretch.
+
+        LOST while too few features have a depth: the next frame tries again.
+        """
         n_points = len(self._mapping.mappable_features(view, Tracks.empty()))
         enough = n_points >= self.config.tracking.min_inliers
         if enough:
@@ -136,6 +141,7 @@ class DyObSlam:
         )
 
     def _grow_map(self, view: View, tracked: TrackedFrame) -> bool:
+        """Whether the frame became a keyframe; LOST ones leave the map alone."""
         if tracked.status is not TrackingStatus.OK:
             return False
         tracks, is_keyframe = self._mapping.integrate(self.map, view, tracked)

@@ -46,10 +46,12 @@ class Tracks:
 
     @classmethod
     def empty(cls) -> Tracks:
+        """No tracks at all."""
         return cls(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty(0))
 
     @classmethod
     def concatenate(cls, *parts: Tracks) -> Tracks:
+        """All parts, in their order."""
         return cls(
             np.concatenate([p.point_ids for p in parts]),
             np.concatenate([p.uv_px for p in parts]),

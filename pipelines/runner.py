@@ -37,16 +37,19 @@ _log = logging.getLogger("dyob.run")
 class Sink(Protocol):
     """Something that watches a run: a progress bar, a viewer, a writer of annotated frames."""
 
-    def start(self, sequence: Sequence, n_frames: int, config: Config, folder: Path) -> None: ...
+    def start(self, sequence: Sequence, n_frames: int, config: Config, folder: Path) -> None:
+        """Before the first frame. folder: the result folder, which exists."""
 
-    def frame(self, frame: Frame, result: FrameResult) -> None: ...
+    def frame(self, frame: Frame, result: FrameResult) -> None:
+        """After each frame that could be read."""
 
-    def finish(self) -> None: ...
+    def finish(self) -> None:
+        """After the last frame, and whatever ended the run; the files are not written yet."""
 
 
 @dataclass(slots=True)
 class _Progress:
-    """What a run has done so far."""
+    """What a run has done so far. skipped: frames that could not be read."""
 
     results: list[FrameResult] = field(default_factory=list)
     skipped: int = 0

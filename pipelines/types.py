@@ -34,8 +34,9 @@ def _check_shape(owner: str, name: str, array: NDArray, expected: tuple[int | No
 class StereoCamera:
     """A rectified pinhole pair, or an RGB-D camera with a virtual right one.
 
-    `bf` is baseline times fx in px * m, so that disparity [px] = bf / depth [m]. Where depth comes
-    from a depth sensor the right camera is virtual: `bf` is then a convention, not a measurement.
+    width, height, fx, fy, cx, cy: px. `bf` is baseline times fx in px * m, so that
+    disparity [px] = bf / depth [m]. Where depth comes from a depth sensor the right camera is
+    virtual: `bf` is then a convention, not a measurement.
     """
 
     width: int
@@ -53,6 +54,7 @@ class StereoCamera:
 
     @property
     def baseline_m(self) -> float:
+        """Distance of the two cameras; by convention where the right one is virtual."""
         return self.bf / self.fx
 
     @property
@@ -145,29 +147,33 @@ class GroundTruth:
 
 
 class TrackingStatus(StrEnum):
-    """Whether the pose of a frame was measured (OK) or only predicted (LOST)."""
+    """Whether the pose of a frame was measured (OK) or only predicted (LOST).
+
+    The pose that a map starts from counts as OK: the world's origin, or where tracking starts anew.
+    """
 
     OK = "OK"
     LOST = "LOST"
 
 
 class MotionHypothesis(StrEnum):
-    """Where the initial camera pose of a frame came from."""
+    """Where the initial camera pose of a frame came from; see `frontend/hypotheses.py`."""
 
-    FIRST_FRAME = "first_frame"
+    FIRST_FRAME = "first_frame"  # or the first one of a new start
     CONSTANT_VELOCITY = "constant_velocity"
     PNP_RANSAC = "pnp_ransac"
     RGBD_ODOMETRY = "rgbd_odometry"
     RELOCALISATION = "relocalisation"
-    NONE = "none"
+    NONE = "none"  # the frame is LOST
 
 
 @dataclass(frozen=True, slots=True)
 class Features:
     """ORB features of one image (parallel arrays of length N).
 
-    uv_px: (N, 2) float64. octave: (N,) int32. angle_deg: (N,) float32. response: (N,) float32.
-    descriptors: (N, 32) uint8. depth_m: (N,) float64, NaN where unknown.
+    uv_px: (N, 2) float64, at full size. octave: (N,) int32, pyramid level, 0 the finest.
+    angle_deg: (N,) float32. response: (N,) float32, strength of the corner. descriptors: (N, 32)
+    uint8. depth_m: (N,) float64, NaN where unknown.
     """
 
     uv_px: Array
@@ -197,6 +203,7 @@ class Features:
 
     @classmethod
     def empty(cls) -> Features:
+        """No features at all."""
         return cls(
             np.empty((0, 2)),
             np.empty(0, np.int32),
@@ -212,10 +219,13 @@ class FrameResult:
     """What the estimator says of one frame.
 
     T_world_camera: (4, 4); measured when status is OK, predicted when LOST.
-    pose_covariance: (6, 6) of the right perturbation [omega (rad), v (m)], NaN when LOST.
-    keypoints_px: (N, 2) static keypoints that the pose was measured with, and candidates.
-    point_ids: (N,) int64, the map point each keypoint observes, -1 where it observes none.
-    inliers: (N,) bool, whether the observation agreed with the pose.
+    pose_covariance: (6, 6) of the right perturbation [omega (rad), v (m)], NaN when LOST, zero
+        where a map starts.
+    is_keyframe: whether the map keeps this frame as one.
+    keypoints_px: (N, 2) places where points of the map were found. point_ids: (N,) int64, these
+        points; -1 would stand for a keypoint of none. inliers: (N,) bool, whether the observation
+        agreed with the pose.
+    reprojection_rmse_px: of the inliers' pixels (u_L, v), NaN where there are none.
     timings_ms: time of each stage of this frame; "total", their sum; in a run also "wall", the time
         since the result before this one, which is less as frames are prepared ahead.
     """
@@ -236,6 +246,7 @@ class FrameResult:
     def __post_init__(self) -> None:
         N = len(self.keypoints_px)
         _check_shape("FrameResult", "T_world_camera", self.T_world_camera, (4, 4))
+        _check_shape("FrameResult", "pose_covariance", self.pose_covariance, (6, 6))
         _check_shape("FrameResult", "keypoints_px", self.keypoints_px, (N, 2))
         _check_shape("FrameResult", "point_ids", self.point_ids, (N,))
         _check_shape("FrameResult", "inliers", self.inliers, (N,))
@@ -245,8 +256,9 @@ class FrameResult:
 class StaticMap:
     """The sparse static map as the outside sees it (parallel arrays of length N).
 
-    points_m: (N, 3) in the world. colors: (N, 3) uint8 RGB. n_observations: (N,) int32.
-    keyframe_Ts_world_camera: (K, 4, 4). keyframe_indices: (K,) int64 frame indices.
+    points_m: (N, 3) in the world. colors: (N, 3) uint8 RGB. n_observations: (N,) int32, frames
+    that found the point. keyframe_Ts_world_camera: (K, 4, 4). keyframe_indices: (K,) int64 frame
+    indices.
     """
 
     points_m: Array

@@ -1,6 +1,9 @@
 """Sub-pixel places of tracked points: Lucas-Kanade alignment, fused with given optical flow.
 
 Owns the measurement of where last frame's points are now. Knows no poses.
+
+Deviation: the paper takes features and flow as they are. Aligned patches have a third of the noise
+of ORB corners, and stand in for the design's joint refinement of flow and pose.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from pipelines.types import Array, Image
 
 _WINDOW_PX = 17  # side of the aligned patch
 _PYRAMID_LEVELS = 1  # one coarser level: the predictions are good to some pixels
+_AGREE_SIGMAS = 3.0  # two measurements further apart are not of the same place
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.005)
 
 
@@ -21,8 +25,8 @@ def align_patches(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Places (N, 2) in `gray_to` of the patches around `uv_from_px` (N, 2) of `gray_from`.
 
-    Starts at `predicted_px` (N, 2). The second answer (N,) says which converged within
-    `max_shift_px` of their prediction.
+    gray_from, gray_to: (H, W). Starts at `predicted_px` (N, 2), NaN where there is no prediction.
+    The second answer (N,) says which converged within `max_shift_px` of their prediction.
     """
     n = len(uv_from_px)
     if n == 0:
@@ -50,13 +54,15 @@ def fuse_measurements(
 ) -> tuple[Array, NDArray[np.bool_], Array]:  # fmt: skip
     """Inverse-variance mean of two measurements (N, 2) of the same places.
 
-    Where only one is valid it stands alone. Where both are and they differ by more than three
+    ok_a, ok_b: (N,) where they are valid. sigma_a_px, sigma_b_px: their standard deviations per
+    axis. Where only one is valid it stands alone. Where both are and they differ by more than three
     standard deviations, one of them is wrong and the more precise source is believed.
     Returns places (N, 2), validity (N,) and standard deviations (N,) in px.
     """
     weight_a, weight_b = sigma_a_px**-2, sigma_b_px**-2
     mean = (weight_a * uv_a_px + weight_b * uv_b_px) / (weight_a + weight_b)
-    agree = np.linalg.norm(uv_a_px - uv_b_px, axis=1) <= 3.0 * np.hypot(sigma_a_px, sigma_b_px)
+    apart_px = np.linalg.norm(uv_a_px - uv_b_px, axis=1)
+    agree = apart_px <= _AGREE_SIGMAS * np.hypot(sigma_a_px, sigma_b_px)
     a_alone = ok_a & (~ok_b | (~agree & (sigma_a_px <= sigma_b_px)))
     b_alone = ok_b & ~a_alone & (~ok_a | ~agree)
     uv = np.where(a_alone[:, None], uv_a_px, np.where(b_alone[:, None], uv_b_px, mean))

@@ -31,7 +31,8 @@ _NEIGHBOURS = 5  # matched points that predict the place of an unmatched one
 class LastFrame:
     """What the next frame is tracked from.
 
-    tracks: the points seen in `view`. flow_starts_here: whether the next frame's flow begins at it.
+    view: the last one that was tracked. tracks: the points seen in it. flow_starts_here: whether
+    the next frame's flow begins at it.
     """
 
     view: View
@@ -140,6 +141,7 @@ def search_local_map(
     """Points of the local map found again in this view, and the ids of all that were in view.
 
     tracks: points already measured, which are not searched for, nor are their features taken.
+    T_world_camera: (4, 4), good to some pixels. Paper, sections ORB Feature Extraction, Sparse Map.
     """
     ids, predicted = sparse_map.local_points(T_world_camera, tracks.point_ids)
     on_static = view.is_static(predicted)

@@ -25,7 +25,9 @@ def robust_sigma(residuals: Array) -> float:
 class NoiseModel:
     """Running standard deviations in px: of pixels by source, and of disparities.
 
-    `memory` is the share of the old value that each new frame keeps.
+    sigma_uv_px: name of the source -> standard deviation per axis. memory: share of the old value
+    that each new frame keeps. floor_px, ceiling_px: limits of what is learned in one frame.
+    Deviation: neither the paper nor the design learns weights; both take fixed ones.
     """
 
     sigma_uv_px: dict[str, float] = field(
@@ -43,6 +45,7 @@ class NoiseModel:
         return bool(self._seen)
 
     def _blend(self, source: str, old: float, residuals: Array) -> float:
+        """The old value moved by one frame's residuals; the first ones replace the guess."""
         if residuals.size < _MIN_SAMPLES:
             return old
         new = float(np.clip(robust_sigma(residuals), self.floor_px, self.ceiling_px))

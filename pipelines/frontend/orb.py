@@ -12,11 +12,15 @@ from numpy.typing import NDArray
 from pipelines.config import OrbConfig
 from pipelines.types import Array, Features, Image
 
+_BORDER_PX = 19  # at each level, so that a turned patch stays in the image (ORB-SLAM)
+_PATCH_PX = 31  # side of the patch that is described (ORB)
+_CORNERS_PER_CELL = 4.0  # wanted: fewer spread more evenly, more let the strong ones win
+_MIN_CELL_PX = 8.0
 _OVERSAMPLING = 3  # corners detected per feature kept, so that spreading has a choice
 
 
 class OrbExtractor:
-    """Detects, spreads and describes ORB corners (paper, section ORB feature extraction).
+    """Detects, spreads and describes ORB corners (paper, section ORB Feature Extraction).
 
     Holds the OpenCV detectors, which are costly to make; it keeps nothing from image to image.
     """
@@ -28,8 +32,8 @@ class OrbExtractor:
             scaleFactor=config.scale_factor,
             nlevels=config.n_levels,
             fastThreshold=config.fast_threshold,
-            edgeThreshold=19,
-            patchSize=31,
+            edgeThreshold=_BORDER_PX,
+            patchSize=_PATCH_PX,
         )
 
     def extract(self, gray: Image, static: NDArray[np.bool_] | None = None) -> Features:
@@ -67,15 +71,14 @@ def spread_evenly(
     """Indices of about `n_wanted` corners spread over the image, the strongest of each cell first.
 
     uv_px: (N, 2). response: (N,). shape: (H, W) in pixels. Corners are ranked inside square cells
-    of about four wanted corners each, and taken rank by rank until there are enough.
+    of about `_CORNERS_PER_CELL` wanted corners, and taken rank by rank until there are enough.
     """
     if len(uv_px) <= n_wanted:
         return np.arange(len(uv_px))
-    cell_px = max(8.0, np.sqrt(4.0 * shape[0] * shape[1] / n_wanted))
+    cell_px = max(_MIN_CELL_PX, np.sqrt(_CORNERS_PER_CELL * shape[0] * shape[1] / n_wanted))
     columns = int(np.ceil(shape[1] / cell_px))
-    cell = (uv_px[:, 1] // cell_px).astype(np.int64) * columns + (uv_px[:, 0] // cell_px).astype(
-        np.int64
-    )
+    column, row = (uv_px // cell_px).astype(np.int64).T
+    cell = row * columns + column
     order = np.lexsort((-response, cell))
     sorted_cell = cell[order]
     starts = np.flatnonzero(np.r_[True, sorted_cell[1:] != sorted_cell[:-1]])

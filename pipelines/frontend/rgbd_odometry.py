@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pipelines.types import Array, Image, StereoCamera
 
 _ITERATIONS = (20, 10, 5)  # per pyramid level, coarse to fine
+_DEPTH_UNITS_PER_M = 1.0
 _MIN_VALID_PIXELS = 2000  # fewer pixels with depth cannot fix a pose
 _MAX_DEPTH_JUMP = 0.05  # depths that differ by more, as a share of the median, do not correspond
 
@@ -29,10 +30,11 @@ def estimate_rgbd_odometry(
     T_prev_curr: Array,
     max_depth_m: float,
 ) -> Array | None:
-    """T_prev_curr (4, 4) of two frames (grey image, depth in m), or None where it fails.
+    """T_prev_curr (4, 4) of two frames, p_prev = T_prev_curr @ p_curr, or None where it fails.
 
-    Depths are NaN where unknown *or dynamic*: moving pixels must be unknown in both frames.
-    T_prev_curr: the guess that seeds the iteration.
+    previous, current: (H, W) uint8 grey and (H, W) float32 depth in m, NaN where unknown *or
+    dynamic*: moving pixels must be unknown in both frames. T_prev_curr: the guess that seeds the
+    iteration. max_depth_m: depths beyond are left out.
     """
     o3d = _import_open3d()
     odometry = o3d.t.pipelines.odometry
@@ -45,7 +47,7 @@ def estimate_rgbd_odometry(
             target,
             o3d.core.Tensor(camera.K),
             o3d.core.Tensor(np.ascontiguousarray(T_prev_curr)),
-            1.0,
+            _DEPTH_UNITS_PER_M,
             max_depth_m,
             [odometry.OdometryConvergenceCriteria(n) for n in _ITERATIONS],
             odometry.Method.PointToPlane,

@@ -77,7 +77,7 @@ def _plane_at(value: Array, weight: Array, du: Array, dv: Array) -> Array:
     """
     n, x, y, xx, yy, xy = (weight @ _MOMENTS).T
     d, dx, dy = (value @ _MOMENTS[:, :3]).T
-    n, xx, yy = n + 1e-9, xx + 1e-3, yy + 1e-3
+    n, xx, yy = n + 1e-9, xx + 1e-3, yy + 1e-3  # a row of pixels alone is taken as level
     a, b, c = xx * yy - xy * xy, xy * y - x * yy, x * xy - xx * y
     e, f, g = n * yy - y * y, x * y - n * xy, n * xx - x * x
     determinant = n * a + x * b + y * c

@@ -31,13 +31,15 @@ from pipelines.frontend.motion_only_ba import PoseEstimate, estimate_camera_pose
 from pipelines.frontend.rgbd_odometry import estimate_rgbd_odometry
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
-from pipelines.geometry import MIN_DEPTH_M, invert_T, project_stereo, transform_points
+from pipelines.geometry import invert_T, project_stereo, transform_points
 from pipelines.mapping.sparse_map import SparseMap
 from pipelines.observations import Tracks
 from pipelines.types import Array, MotionHypothesis, TrackingStatus
 
 _RELOCALISED_SHARE = 0.5  # of descriptor matches that must agree with a pose found by them
 _RELOCALISE_AGAINST = 5  # latest keyframes tried when lost
+_RELOCALISE_RATIO = 0.8  # of the best to the second best distance (Lowe)
+_RELOCALISE_SLACK = 2.0  # times `inlier_px`: features lie on coarse levels too, unaligned
 
 Stage = Callable[[str], AbstractContextManager[None]]
 
@@ -46,9 +48,10 @@ Stage = Callable[[str], AbstractContextManager[None]]
 class TrackedFrame:
     """The answer of tracking one view.
 
-    T_world_camera: (4, 4), predicted if LOST. covariance: (6, 6), NaN if LOST.
-    tracks: all points measured. inliers: (N,) bool of the tracks. rmse_px: of the inliers' pixels.
-    visible_ids: points of the local map that were in view.
+    T_world_camera: (4, 4), predicted if LOST. covariance: (6, 6) of the right perturbation
+    [omega rad, v m], NaN if LOST. tracks: all points measured. inliers: (N,) bool of the tracks.
+    rmse_px: of the inliers' pixels (u_L, v). visible_ids: (M,) points of the local map in view,
+    whether found or not.
     """
 
     status: TrackingStatus
@@ -88,8 +91,11 @@ class Tracker:
     # -------------------------------------------------------------- tracking
 
     def track(self, view: View, sparse_map: SparseMap, stage: Stage | None = None) -> TrackedFrame:
-        """Pose of a view: motion hypotheses, bundle adjustment, local map, again adjustment."""
-        stage = stage or (lambda name: nullcontext())
+        """Pose of a view: motion hypotheses, bundle adjustment, local map, again adjustment.
+
+        The map is read, not changed. stage: times the parts by name. Losing track is an answer.
+        """
+        stage = stage or (lambda _: nullcontext())
         assert self.motion is not None
         T_predicted = self.motion.predict(view.timestamp_s)
         with stage("track"):
@@ -151,25 +157,29 @@ class Tracker:
     ) -> tuple[MotionHypothesis, Array, Measurement]:
         """The best motion hypothesis, with the measurements that it was judged by.
 
-        Constant velocity and PnP RANSAC compete always. Where the winner holds less than
-        `weak_inlier_share` of the points, or too few in all, dense odometry and then a search
-        among recent keyframes try as well, each with measurements around its own prediction.
+        Constant velocity and PnP RANSAC compete always, as in the paper. Where the winner holds
+        less than `weak_inlier_share` of the points, or too few in all, dense odometry and then a
+        search among recent keyframes try as well, each with measurements around its own guess.
+        Deviation: dense odometry costs too much to compete in every frame, as designed at first.
         """
         measured = self._measure(view, sparse_map, T_predicted)
-        best = self._compete(
-            sparse_map, measured, {MotionHypothesis.CONSTANT_VELOCITY: T_predicted}
+        constant_velocity = MotionHypothesis.CONSTANT_VELOCITY
+        name, T, n_inliers = self._compete(sparse_map, measured, constant_velocity, T_predicted)
+        fallbacks: tuple[tuple[MotionHypothesis, Callable[[], Array | None]], ...] = (
+            (MotionHypothesis.RGBD_ODOMETRY, lambda: self._dense_odometry(view, T_predicted)),
+            (MotionHypothesis.RELOCALISATION, lambda: self._relocalise(view, sparse_map)),
         )
-        for attempt in (self._dense_hypothesis, self._relocalise):
-            if not self._is_weak(best[2], len(measured.tracks)):
+        for rival, estimate in fallbacks:
+            if not self._is_weak(n_inliers, len(measured.tracks)):
                 break
-            name, T_guess = attempt(view, sparse_map, T_predicted)
+            T_guess = estimate()
             if T_guess is None:
                 continue
             again = self._measure(view, sparse_map, T_guess)
-            rival = self._compete(sparse_map, again, {name: T_guess})
-            if rival[2] > best[2]:
-                best, measured = (name, rival[1], rival[2]), again
-        return best[0], best[1], measured
+            _, T_again, n_again = self._compete(sparse_map, again, rival, T_guess)
+            if n_again > n_inliers:  # whoever won: it did on measurements that the rival led to
+                name, T, n_inliers, measured = rival, T_again, n_again, again
+        return name, T, measured
 
     def _measure(self, view: View, sparse_map: SparseMap, T: Array) -> Measurement:
         assert self._last is not None
@@ -183,23 +193,23 @@ class Tracker:
         self,
         sparse_map: SparseMap,
         measured: Measurement,
-        candidates: dict[MotionHypothesis, Array | None],
+        name: MotionHypothesis,
+        T_world_camera: Array,
     ) -> tuple[MotionHypothesis, Array, int]:
-        """The given hypotheses against PnP RANSAC on the same measurements."""
+        """A hypothesis against PnP RANSAC on the same measurements: the winner and its inliers."""
         points = sparse_map.position_m[measured.tracks.point_ids]
         uv = measured.tracks.uv_px
         limit, seed = self.config.inlier_px, self.config.seed
         pnp = estimate_pnp(self.camera, points, uv, limit, seed)
-        every = {**candidates, MotionHypothesis.PNP_RANSAC: pnp}
-        return choose_hypothesis(self.camera, every, points, uv, limit)
+        candidates = {name: T_world_camera, MotionHypothesis.PNP_RANSAC: pnp}
+        return choose_hypothesis(self.camera, candidates, points, uv, limit)
 
-    def _dense_hypothesis(
-        self, view: View, sparse_map: SparseMap, T_predicted: Array
-    ) -> tuple[MotionHypothesis, Array | None]:
-        """Open3D's RGB-D odometry from the last view, seeded with the prediction."""
-        name = MotionHypothesis.RGBD_ODOMETRY
-        if not self.config.use_rgbd_odometry or self._last is None or self.motion is None:
-            return name, None
+    def _dense_odometry(self, view: View, T_predicted: Array) -> Array | None:
+        """T_world_camera (4, 4) by RGB-D odometry from the last view, seeded by prediction."""
+        if not self.config.use_rgbd_odometry:
+            return None
+        assert self._last is not None
+        assert self.motion is not None
         last = self._last.view
         T_prev_curr = estimate_rgbd_odometry(
             self.camera,
@@ -208,45 +218,46 @@ class Tracker:
             invert_T(self.motion.T_world_camera) @ T_predicted,
             self.camera.bf / self.sensor.min_close_disparity_px,
         )
-        return name, None if T_prev_curr is None else self.motion.T_world_camera @ T_prev_curr
+        return None if T_prev_curr is None else self.motion.T_world_camera @ T_prev_curr
 
-    def _relocalise(
-        self, view: View, sparse_map: SparseMap, T_predicted: Array
-    ) -> tuple[MotionHypothesis, Array | None]:
-        """Pose by descriptors alone, against the points of the latest keyframes."""
-        name = MotionHypothesis.RELOCALISATION
+    def _relocalise(self, view: View, sparse_map: SparseMap) -> Array | None:
+        """T_world_camera (4, 4) by descriptors alone, against points of the latest keyframes."""
         recent = sparse_map.keyframes[-_RELOCALISE_AGAINST:]
         if not recent:
-            return name, None
+            return None
         ids = np.unique(np.concatenate([k.tracks.point_ids for k in recent]))
         ids = ids[sparse_map.alive[ids]]
         points, features = match_all(
-            sparse_map.descriptor[ids], view.features.descriptors, self.config.max_hamming, 0.8
+            sparse_map.descriptor[ids],
+            view.features.descriptors,
+            self.config.max_hamming,
+            _RELOCALISE_RATIO,
         )
         if len(points) < self.config.min_inliers:
-            return name, None
+            return None
         world, uv = sparse_map.position_m[ids[points]], view.features.uv_px[features]
-        T = estimate_pnp(self.camera, world, uv, 2.0 * self.config.inlier_px, self.config.seed)
+        limit = _RELOCALISE_SLACK * self.config.inlier_px
+        T = estimate_pnp(self.camera, world, uv, limit, self.config.seed)
         if T is None:
-            return name, None
-        n = reprojection_inliers(self.camera, T, world, uv, 2.0 * self.config.inlier_px).sum()
+            return None
+        n = reprojection_inliers(self.camera, T, world, uv, limit).sum()
         enough = max(self.config.min_inliers, _RELOCALISED_SHARE * len(world))
-        return name, T if n >= enough else None
+        return T if n >= enough else None
 
     # ----------------------------------------------------------------- noise
 
     def _learn_noise(
         self, sparse_map: SparseMap, measured: Measurement, estimate: PoseEstimate
     ) -> None:
-        points = transform_points(
-            invert_T(estimate.T_world_camera), sparse_map.position_m[measured.tracks.point_ids]
-        )
-        good = estimate.inliers & (points[:, 2] > MIN_DEPTH_M)
-        predicted = project_stereo(self.camera, points[good])[:, :2]
+        """Each source's own residuals at the inliers teach its noise, not those of their mean."""
+        good = estimate.inliers  # all in front of the camera
+        points = sparse_map.position_m[measured.tracks.point_ids[good]]
+        points = transform_points(invert_T(estimate.T_world_camera), points)
+        predicted = project_stereo(self.camera, points)[:, :2]
         for source, uv in measured.sources_px.items():
             residual = uv[good] - predicted
             self.noise.learn_uv(source, residual[np.isfinite(residual).all(axis=1)])
-        r = estimate.residuals_px[estimate.inliers]
+        r = estimate.residuals_px[good]
         disparity = r[:, 0] - r[:, 2]
         self.noise.learn_disparity(disparity[np.isfinite(disparity)])
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.depth import to_gray
 from pipelines.frontend.orb import OrbExtractor
 from pipelines.frontend.sampling import sample_disparity
 from pipelines.types import Array, Features, Frame, Image, StereoCamera
@@ -25,9 +26,10 @@ _CONTRAST_FLOOR = 10.0  # grey levels of standard deviation below which contrast
 class View:
     """One frame, ready for tracking.
 
-    gray: (H, W) uint8. disparity_px: (H, W) float32, NaN where unknown. static: (H, W) bool, False
-    on movable objects and around them. features: ORB on static pixels, with depth.
-    flow_prev_to_curr_px: (H, W, 2) on the previous frame's pixels, or None.
+    image: as in `Frame`. gray: (H, W) uint8. disparity_px: (H, W) float32, corrected by the learned
+    offset, NaN where unknown. static: (H, W) bool, False on movable objects and around them.
+    features: ORB on static pixels, with depth in m. flow_prev_to_curr_px: (H, W, 2) on the previous
+    frame's pixels, or None.
     """
 
     frame_index: int
@@ -54,15 +56,13 @@ class View:
         return np.where(self.static & (self.disparity_px > 0), depth, np.float32(np.nan))
 
 
-def to_gray(image: Image) -> Image:
-    """(H, W) uint8 of a grey or RGB image."""
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-
-
 def static_pixels(
     instance_labels: NDArray[np.int32] | None, shape: tuple[int, int], dilation_px: int
 ) -> NDArray[np.bool_]:
-    """(H, W) bool: pixels off all movable instances, which are dilated against worn masks."""
+    """(H, W) bool: pixels off all movable instances, which grow by `dilation_px` on each side.
+
+    Masks are worn at their edges, and an ORB patch there would see the object.
+    """
     if instance_labels is None:
         return np.ones(shape, bool)
     movable = (instance_labels > 0).astype(np.uint8)
@@ -71,7 +71,10 @@ def static_pixels(
 
 
 def normalise_contrast(gray: Image) -> Image:
-    """(H, W) uint8 with even local contrast, so that corners in shade or on asphalt count too."""
+    """(H, W) uint8 with even local contrast, so that corners in shade or on asphalt count too.
+
+    Deviation: the paper detects ORB on the plain image, which leaves the ground nearly bare.
+    """
     half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # smooth anyway
     size = (_CONTRAST_WINDOW_PX // 2, _CONTRAST_WINDOW_PX // 2)
     mean = cv2.boxFilter(half, cv2.CV_32F, size)
@@ -89,8 +92,8 @@ def normalise_contrast(gray: Image) -> Image:
 class PreparedFrame:
     """What can be said of a frame before anything is known of its pose, or of the sensor's errors.
 
-    disparity_px: (H, W) float32 as measured, NaN where unknown. static: (H, W) bool. features: ORB
-    on static pixels, without depth. timings_ms: wall time of each stage so far.
+    gray: (H, W) uint8. disparity_px: (H, W) float32 as measured, NaN where unknown. static: (H, W)
+    bool. features: ORB on static pixels, without depth. timings_ms: wall time of each stage so far.
     """
 
     frame: Frame
@@ -123,7 +126,12 @@ def complete_view(
     sigma_disparity_px: float,
     disparity_offset_px: float,
 ) -> View:
-    """The view of a prepared frame, by what is known of the sensor's disparities now."""
+    """The view of a prepared frame, by what is known of the sensor's disparities now.
+
+    sigma_disparity_px: their noise. disparity_offset_px: true minus measured.
+    Deviation: the paper matches ORB features of both images for their depth; here it is read off
+    the dense disparities, which serves stereo and RGB-D alike.
+    """
     disparity, features = prepared.disparity_px, prepared.features
     if disparity_offset_px != 0.0:
         disparity = disparity + np.float32(disparity_offset_px)
@@ -141,16 +149,3 @@ def complete_view(
         features,
         frame.flow_prev_to_curr_px,
     )
-
-
-def make_view(
-    camera: StereoCamera,
-    frame: Frame,
-    depth_m: NDArray[np.float32] | None,
-    orb: OrbExtractor,
-    sigma_disparity_px: float,
-    disparity_offset_px: float,
-) -> View:
-    """The view of a frame whose depth (H, W) in m is known; None means no depth at all."""
-    prepared = prepare_frame(camera, frame, depth_m, orb)
-    return complete_view(camera, prepared, sigma_disparity_px, disparity_offset_px)

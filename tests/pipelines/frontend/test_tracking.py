@@ -9,7 +9,7 @@ from pipelines.frontend.orb import OrbExtractor
 from pipelines.frontend.rgbd_odometry import estimate_rgbd_odometry
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame, Tracker
-from pipelines.frontend.view import make_view
+from pipelines.frontend.view import complete_view, prepare_frame
 from pipelines.geometry import exp_se3, invert_T, rotation_angle_deg
 from pipelines.mapping.local_mapping import LocalMapping
 from pipelines.mapping.sparse_map import SparseMap
@@ -88,7 +88,8 @@ class Run:
         if black:
             gray = np.zeros_like(gray)
         frame = Frame(index, 0.1 * index, gray, depth_m=depth, flow_prev_to_curr_px=flow)
-        return make_view(CAMERA, frame, depth, self.orb, self.sensor.noise.sigma_disparity_px, 0.0)
+        prepared = prepare_frame(CAMERA, frame, depth, self.orb)
+        return complete_view(CAMERA, prepared, self.sensor.noise.sigma_disparity_px, 0.0)
 
     def begin(self, T):
         view = self.view(T, 0)

@@ -6,7 +6,13 @@ import pytest
 
 from pipelines.config import OrbConfig
 from pipelines.frontend.orb import OrbExtractor
-from pipelines.frontend.view import make_view, normalise_contrast, static_pixels, to_gray
+from pipelines.frontend.view import (
+    complete_view,
+    normalise_contrast,
+    prepare_frame,
+    static_pixels,
+    to_gray,
+)
 from pipelines.types import Frame, StereoCamera
 
 H, W = 200, 320
@@ -27,8 +33,11 @@ def labelled_box():
 
 
 def view_of(depth_m, offset_px=0.0, **more):
-    frame = Frame(7, 1.25, textured(), **more)
-    return make_view(CAMERA, frame, depth_m, ORB, 0.1, offset_px)
+    return complete(Frame(7, 1.25, textured(), **more), depth_m, offset_px)
+
+
+def complete(frame, depth_m, offset_px=0.0):
+    return complete_view(CAMERA, prepare_frame(CAMERA, frame, depth_m, ORB), 0.1, offset_px)
 
 
 def slanted_depth():
@@ -147,7 +156,7 @@ def test_contrast_is_evened_but_noise_is_not_blown_up():
 def test_evened_contrast_brings_features_to_faint_parts():
     gray = textured().astype(np.float32)
     gray[:, W // 2 :] = 128 + 0.5 * (gray[:, W // 2 :] - 128)
-    view = make_view(CAMERA, Frame(0, 0.0, gray.astype(np.uint8)), None, ORB, 0.1, 0.0)
+    view = complete(Frame(0, 0.0, gray.astype(np.uint8)), None)
     alone = ORB.extract(gray.astype(np.uint8))
     faint, faint_alone = ((f.uv_px[:, 0] > W / 2).mean() for f in (view.features, alone))
     assert faint > faint_alone + 0.1
@@ -159,7 +168,7 @@ def test_frame_is_not_changed():
     depth = slanted_depth()
     depth[:10] = np.nan
     before = frame.image.copy(), depth.copy(), frame.instance_labels.copy()
-    make_view(CAMERA, frame, depth, ORB, 0.1, 0.3)
+    complete(frame, depth, 0.3)
     for now, then in zip((frame.image, depth, frame.instance_labels), before, strict=True):
         np.testing.assert_array_equal(now, then)
 

@@ -1,5 +1,7 @@
 """The sparse map's books: stable ids, rows used again, covisibility, local points, culling."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -304,3 +306,11 @@ def test_covisible_keyframes_are_most_shared_first_for_older_ones_too():
     for k, seen in enumerate((ids, ids[:20], ids[:90])):
         sparse_map.add_keyframe(keyframe_of(seen, frame_index=k))
     assert sparse_map.covisible_keyframes(0).tolist() == [2, 1]
+
+
+@pytest.mark.parametrize("name", ["mapping/sparse_map", "mapping/keyframe", "observations"])
+def test_what_the_front_end_reads_of_the_map_does_not_know_the_front_end(name):
+    source = Path(__file__).parents[3] / "pipelines" / f"{name}.py"
+    imported = [line for line in source.read_text().splitlines() if "import" in line]
+    assert len(imported) > 2
+    assert not [line for line in imported if "pipelines.frontend" in line]
