@@ -24,6 +24,13 @@ DATASETS = {
 }
 
 
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".bag")
+_ASK_DATASETS = (
+    "see which files each layout wants with 'python3 -m app datasets', or name one with --dataset "
+    "to hear what it lacks"
+)
+
+
 def load_dataset(dataset: str) -> Any:
     """The class of a data set by its name in the table; raises DatasetError for an unknown one."""
     if dataset not in DATASETS:
@@ -58,27 +65,37 @@ def _guess(path: Path | str) -> str:
     if len(found) == 1:
         return found[0]
     folder = Path(path)
+    if not folder.is_dir():
+        raise DatasetError(_no_folder(folder))
     if len(found) > 1:
         raise DatasetError(
             f"{folder}: looks like {' and like '.join(found)}; say which one with --dataset."
         )
-    if not folder.is_dir():
-        raise DatasetError(_no_folder(folder, list(DATASETS)))
+    hint = _hint_inside(folder) or _hint_at_video(folder) or _ASK_DATASETS
+    layouts = [dataset for dataset in DATASETS if dataset != "simulated"]
     raise DatasetError(
-        f"{folder}: no known sequence.{_hint_inside(folder)} Found: {_describe(folder)}. "
-        f"{_expected(list(DATASETS))}"
+        f"{folder}: expected a sequence laid out as {', '.join(layouts[:-1])} or {layouts[-1]}, "
+        f"found {_describe(folder)}; {hint}"
     )
 
 
-def _no_folder(path: Path, datasets: list[str]) -> str:
-    parent = path.resolve().parent
-    what = "a file, expected a folder" if path.exists() else "no such folder"
-    return f"{path}: {what}. {parent} has: {_describe(parent)}. {_expected(datasets)}"
+def _no_folder(path: Path) -> str:
+    if path.is_file():
+        video = " of images, since videos are not read" if path.suffix.lower() in VIDEOS else ""
+        return f"{path}: expected a folder{video}, found a file; give the folder of a sequence"
+    inner = [p.name for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
+    nearest = difflib.get_close_matches(path.name, inner, 1, 0.75)
+    advice = f"did you mean {path.parent / nearest[0]}?" if nearest else "correct the path"
+    return f"{path}: expected the folder of a sequence, found no such folder; {advice}"
 
 
-def _expected(datasets: list[str]) -> str:
-    trees = [f"\n  {name}: {load_dataset(name).layout}" for name in datasets]
-    return "Expected one of these:" + "".join(trees)
+def _hint_at_video(folder: Path) -> str:
+    if not any(p.suffix.lower() in VIDEOS for p in folder.iterdir()):
+        return ""
+    return (
+        "videos are not read, and one camera alone has no scale: give images with depth or right "
+        "images beside them, as 'python3 -m app datasets folder' says"
+    )
 
 
 def _describe(folder: Path) -> str:
@@ -92,7 +109,7 @@ def _hint_inside(folder: Path) -> str:
     for inner in sorted(p for p in folder.iterdir() if p.is_dir())[:50]:
         found = matching_datasets(inner)
         if len(found) == 1:
-            return f" Its sub-folder {inner.name} looks like {found[0]}: open {inner}."
+            return f"its sub-folder {inner.name} looks like {found[0]}: give {inner}"
     return ""
 
 

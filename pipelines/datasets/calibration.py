@@ -23,9 +23,9 @@ CAMERA_KEYS = (
     *("fps", "depth_scale", "depth_form"),
 )
 CAMERA_YAML = (
-    "camera.yaml with one `key: value` a line: fx, fy, cx, cy in pixels; bf (px * m) or "
-    "baseline_m; fps unless there is a times.txt; depth_scale, the value of 1 m in depth images; "
-    "width and height if you like"
+    "camera.yaml with one `key: value` a line: fx, fy, cx, cy in pixels; of a stereo pair "
+    "baseline_m (or bf, px * m); of depth images depth_scale, the value of 1 m (1000 for "
+    "millimetres); fps unless there is a times.txt; width and height if you like"
 )
 
 

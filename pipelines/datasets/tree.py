@@ -80,8 +80,8 @@ def describe_folder(folder: Path) -> str:
 
 
 def tree_error(dataset: str, layout: str, root: Path, missing: str, advice: str) -> DatasetError:
-    """The error of a layout that lacks something: `missing`, the tree, what is there, `advice`."""
+    """The error of a layout that lacks something: `missing`, `advice`, the tree, what is there."""
     return DatasetError(
-        f"{root} as {dataset}: {missing}. Expected: {layout}. "
-        f"Found: {describe_folder(root)}. {advice}"
+        f"{root} as {dataset}: {missing}. {advice} "
+        f"Expected: {layout}. Found: {describe_folder(root)}."
     )

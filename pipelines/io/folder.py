@@ -52,8 +52,12 @@ def create_result_folder(root: Path | str, name: str) -> Path:
 
 
 def clear_result_folder(folder: Path | str) -> None:
-    """Remove what an earlier run left in `folder`: the files named above and nothing else."""
+    """Make `folder`, or remove what an earlier run left in it: files named above, nothing else.
+
+    Raises DyObError where it holds files but is no run's, such as a folder of data.
+    """
     folder = Path(folder)
+    _check_output(folder)
     files = [CONFIG, LOG, CAMERA_TUM, CAMERA_KITTI, CAMERA_GT_TUM, STATIC_MAP]
     stale = [folder / name for name in (*files, METRICS_JSON, METRICS_TXT, TIMINGS)]
     for name in (FRAMES, PLOTS, RENDERS):
@@ -66,6 +70,25 @@ def clear_result_folder(folder: Path | str) -> None:
             f"{path}: expected to replace an earlier run's file, found '{error.strerror}'; "
             "choose another --output"
         ) from error
+
+
+def _check_output(folder: Path) -> None:
+    """A new or empty folder or an earlier run's; in others, files of these names may be dear."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        held = sorted(path.name for path in folder.iterdir())
+    except OSError as error:
+        found = "a file" if folder.is_file() else f"'{error.strerror}'"
+        raise DyObError(
+            f"{folder}: expected a folder to put the result in, found {found}; "
+            "choose another --output"
+        ) from error
+    if held and LOG not in held:
+        more = " and more" if len(held) > 3 else ""
+        raise DyObError(
+            f"{folder}: expected a new or empty folder or an earlier result with {LOG}, "
+            f"found {', '.join(held[:3])}{more} in it; choose another --output"
+        )
 
 
 def _first_free(root: Path, base: str) -> Path:
@@ -107,7 +130,7 @@ def open_result_folder(path: Path | str) -> Path:
         found = "a file" if path.exists() else "nothing"
         raise FormatError(
             f"{path}: expected a result folder, found {found}; "
-            "name a folder that 'python -m app run' has written, such as results/latest"
+            "run a sequence first, or name the folder that a run has printed"
         )
     if not (path / CAMERA_TUM).is_file():
         hint = "run a sequence first"

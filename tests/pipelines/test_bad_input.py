@@ -76,7 +76,7 @@ def test_a_missing_folder_is_named(tmp_path) -> None:
 def test_an_empty_folder_is_told_what_was_expected(tmp_path) -> None:
     with pytest.raises(DatasetError, match="empty") as raised:
         open_sequence(tmp_path)
-    for layout in ("vdo:", "kitti_odometry:", "tum_rgbd:", "folder:"):
+    for layout in ("vdo", "kitti_odometry", "tum_rgbd", "folder"):
         assert layout in str(raised.value)
 
 

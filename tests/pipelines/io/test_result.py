@@ -7,6 +7,7 @@ import pytest
 
 from pipelines.errors import DyObError, FormatError
 from pipelines.geometry import exp_se3, make_T
+from pipelines.io.folder import clear_result_folder
 from pipelines.io.result import ResultWriter, create_result_folder, load_result, run_metrics
 from pipelines.io.trajectory import read_kitti, read_tum
 from pipelines.types import (
@@ -67,6 +68,23 @@ def test_an_output_that_is_a_file(tmp_path):
     (tmp_path / "results").write_text("")
     with pytest.raises(DyObError, match="expected a folder to put results in"):
         create_result_folder(tmp_path / "results", "run")
+
+
+def test_an_output_with_other_files_is_left_alone(tmp_path):
+    (tmp_path / "frames").mkdir()
+    picture = tmp_path / "frames" / "000000.png"
+    picture.write_bytes(b"dear")
+    with pytest.raises(DyObError, match=r"expected a new or empty folder.*found frames in it"):
+        clear_result_folder(tmp_path)
+    assert picture.read_bytes() == b"dear"
+    (tmp_path / "run.log").touch()  # a run was here: its pictures are replaced
+    clear_result_folder(tmp_path)
+    assert not picture.exists()
+    clear_result_folder(tmp_path / "new" / "folder")
+    assert (tmp_path / "new" / "folder").is_dir()
+    (tmp_path / "file").touch()
+    with pytest.raises(DyObError, match="found a file; choose another --output"):
+        clear_result_folder(tmp_path / "file")
 
 
 def test_round_trip(tmp_path):
@@ -136,7 +154,7 @@ def test_only_the_trajectory_is_needed(tmp_path):
 
 
 def test_what_is_no_result_folder(tmp_path):
-    with pytest.raises(FormatError, match=r"found nothing.*results/latest"):
+    with pytest.raises(FormatError, match="found nothing; run a sequence first"):
         load_result(tmp_path / "gone")
     with pytest.raises(FormatError, match=r"camera_tum\.txt.*run a sequence first"):
         load_result(tmp_path)
