@@ -42,8 +42,8 @@ class Progress:
         self._started_s = self._printed_s = time.monotonic()
         camera = sequence.camera
         stderr.print(
-            f"{sequence.name} ({sequence.dataset}): {n_frames} frames, "
-            f"{camera.width}x{camera.height}",
+            f"{sequence.name} ({sequence.dataset}): {n_frames} "
+            f"{'frame' if n_frames == 1 else 'frames'}, {camera.width}x{camera.height}",
             highlight=False,
         )
         if stderr.is_terminal:
@@ -91,7 +91,7 @@ def warnings() -> Iterator[None]:
         handler = RichHandler(console=stderr, show_time=False, show_path=False)
     else:
         handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+        handler.setFormatter(logging.Formatter("warning: %(message)s"))
     handler.setLevel(logging.WARNING)
     logger.addHandler(handler)
     try:
@@ -118,37 +118,37 @@ def counting(what: str, quiet: bool = False) -> Iterator[Callable[[int, int], No
     """A function (done, total) that shows how far something is; nothing appears before its call."""
     columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     printed_s = time.monotonic()
-    with RichProgress(*columns, console=stderr, transient=True) as bar:
-        task: Any = None
+    bar = RichProgress(*columns, console=stderr, transient=True)
+    task: Any = None
 
-        def show(done: int, total: int) -> None:
-            nonlocal task, printed_s
-            if quiet:
-                return
-            if stderr.is_terminal:
-                task = bar.add_task("", total=total) if task is None else task
-                bar.update(task, completed=done)
-            elif done == total or time.monotonic() - printed_s >= PLAIN_EVERY_S:
-                printed_s = time.monotonic()
-                stderr.print(f"  {what}: {done} of {total}", highlight=False)
+    def show(done: int, total: int) -> None:
+        nonlocal task, printed_s
+        if quiet:
+            return
+        if stderr.is_terminal:
+            if task is None:
+                bar.start()
+                task = bar.add_task("", total=total)
+            bar.update(task, completed=done)
+        elif done == total or time.monotonic() - printed_s >= PLAIN_EVERY_S:
+            printed_s = time.monotonic()
+            stderr.print(f"  {what}: {done} of {total}", highlight=False)
 
+    try:
         yield show
+    finally:
+        if task is not None:
+            bar.stop()
 
 
 def metrics(metrics: dict[str, Any], timings: dict[str, Any], folder: str) -> None:
-    """The table of a run: counts, errors with units, times."""
-    from pipelines.evaluation.table import metrics_table, metrics_text
+    """What a run gave, as metrics.txt says it: counts, errors with units, times."""
+    from pipelines.evaluation.table import ERRORS, TIMES, metrics_text
 
-    if stdout.is_terminal:
-        table = Table(title=folder, title_justify="left", show_header=False)
-        table.add_column()
-        table.add_column(justify="right")
-        table.add_column(style="dim")
-        for row in metrics_table(metrics, timings):
-            table.add_row(*(Text(cell) for cell in row))
-        stdout.print(table)
-    else:
-        stdout.print(f"{folder}\n{metrics_text(metrics, timings)}", end="", **_PLAIN)
+    for line in metrics_text(metrics, timings).splitlines():
+        heading = line.startswith((ERRORS, TIMES))
+        stdout.print(Text(line, style="bold" if heading else ""), soft_wrap=True)
+    say(f"\nResult: {folder}")
     if metrics.get("run", {}).get("interrupted"):
         stdout.print("Stopped before the end: the result holds the frames until then.", **_PLAIN)
 

@@ -6,6 +6,6 @@ estimator, and the estimator imports nothing from here.
 
 from pipelines.evaluation.camera import evaluate_camera
 from pipelines.evaluation.folder import evaluate_result
-from pipelines.evaluation.table import metrics_table, metrics_text
+from pipelines.evaluation.table import metrics_text
 
-__all__ = ["evaluate_camera", "evaluate_result", "metrics_table", "metrics_text"]
+__all__ = ["evaluate_camera", "evaluate_result", "metrics_text"]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pipelines.errors import FormatError
-from pipelines.evaluation import evaluate_result, metrics_table
+from pipelines.evaluation import evaluate_result, metrics_text
+from pipelines.evaluation.table import STATISTICS
 from pipelines.geometry import exp_se3
 from pipelines.io.result import ResultWriter, run_metrics
 from pipelines.types import (
@@ -74,7 +75,9 @@ def test_camera_block_is_renewed_and_others_stay(tmp_path):
     assert metrics["extra"] == {"a": 1}
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     text = (tmp_path / "metrics.txt").read_text()
-    assert f"{metrics['camera']['rpe_trans_rmse_m']:.5f}  m/frame" in text
+    row = next(line for line in text.splitlines() if line.startswith("RPE, translation"))
+    assert f" {metrics['camera']['rpe_trans_rmse_m']:.5f} " in row
+    assert row.endswith("m a frame")
     assert "20.0  ms" in text
     assert evaluate_result(tmp_path) == metrics
 
@@ -107,6 +110,24 @@ def test_no_folder(tmp_path):
         evaluate_result(tmp_path / "gone")
 
 
-def test_table_has_only_what_there_is():
-    rows = metrics_table({"run": {"frames": 3}, "camera": {"ate_rmse_m": 0.5, "ate_max_m": None}})
-    assert [(value, unit) for _, value, unit in rows] == [("3", ""), ("0.5000", "m")]
+def test_text_has_only_what_there_is():
+    text = metrics_text(
+        {"run": {"frames": 3, "tracked": 2}, "camera": {"ate_rmse_m": 0.5, "ate_max_m": None}}
+    )
+    frames, blank, heading, ate = text.splitlines()
+    assert frames.split() == ["Frames", "2", "of", "3", "tracked"]
+    assert blank == ""
+    assert heading.split()[-1] == "largest"
+    assert ate.split()[-2:] == ["0.5000", "m"]
+    assert metrics_text({}).startswith("No metrics")
+
+
+def test_values_stand_under_their_headings():
+    camera = {f"ate_{name}_m": value for name, value in zip(STATISTICS, (4, 3, 2, 5), strict=True)}
+    camera["step_length_ratio"] = 1.01
+    run = {"sequence": "a_name_that_is_wider_than_80_columns" + 60 * "_"}
+    heading, ate, ratio = metrics_text({"run": run, "camera": camera}).splitlines()[2:]
+    for words, value in (("RMSE", "4.0000"), ("mean", "3.0000"), ("largest", "5.0000")):
+        assert ate[: heading.index(words) + len(words)].endswith(value)
+    assert ratio[: heading.index("RMSE") + 4].endswith("1.0100")
+    assert len(ate) < 80
