@@ -45,11 +45,13 @@ def title_lines(result: Result) -> list[str]:
     of = f" of {run['frames']}" if run.get("frames") else ""
     lines = [str(run.get("sequence") or result.folder.name)]
     facts = [f"{frames}{of} frames tracked", f"{len(result.static_points_m):,} map points"]
+    if camera.get("path_length_m") is not None:
+        facts.append(f"{camera['path_length_m']:.1f} m of path")
     lines.append(",  ".join(facts))
     if camera.get("ate_rmse_m") is not None and camera.get("rpe_trans_rmse_m") is not None:
         lines.append(
             f"ATE {100 * camera['ate_rmse_m']:.2f} cm,  RPE {100 * camera['rpe_trans_rmse_m']:.2f} "
-            f"cm and {camera['rpe_rot_rmse_deg']:.3f}° a frame,  {camera['path_length_m']:.1f} m"
+            f"cm and {camera['rpe_rot_rmse_deg']:.3f}° a frame"
         )
     return lines
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import DyObError
+from pipelines.evaluation.table import hypothesis_words
 from pipelines.io.files import replacing
 from pipelines.io.folder import FRAMES
 from pipelines.io.timings import frame_total_ms
@@ -141,12 +142,12 @@ def _status_texts(result: FrameResult) -> list[str]:
     texts = [f"frame {result.frame_index}", f"{result.timestamp_s:.2f} s"]
     tracked = int((result.point_ids >= 0).sum())
     texts.append(f"{int(result.inliers.sum())} of {tracked} points agree")
-    texts.append(str(result.hypothesis).replace("_", " "))
+    texts.append(hypothesis_words(result.hypothesis))
     total_ms = frame_total_ms(result)
     if total_ms > 0:
         texts.append(f"{total_ms:.0f} ms")
     if np.isfinite(result.reprojection_rmse_px):
-        texts.append(f"{result.reprojection_rmse_px:.2f} px")
+        texts.append(f"{result.reprojection_rmse_px:.2f} px error")
     if result.is_keyframe:
         texts.append("keyframe")
     return texts
@@ -169,6 +170,7 @@ class FrameWriter:
         self._queue: queue.Queue[tuple[Frame, FrameResult] | None] = queue.Queue(self.WAITING)
         self._thread: threading.Thread | None = None
         self._failed = False
+        self._n_seen = 0
 
     def start(self, sequence: Any, n_frames: int, config: Any, folder: Path) -> None:
         """Make `frames` in the result folder and start the thread."""
@@ -186,7 +188,9 @@ class FrameWriter:
 
     def frame(self, frame: Frame, result: FrameResult) -> None:
         """Hand one frame over; it is drawn later."""
-        if self._thread is None or self._failed or frame.index % self.every:
+        wanted = self._n_seen % self.every == 0
+        self._n_seen += 1
+        if self._thread is None or self._failed or not wanted:
             return
         light = replace(frame, image_right=None, depth_m=None, flow_prev_to_curr_px=None)
         self._queue.put((light, result))

@@ -20,6 +20,7 @@ from pipelines.io import folder as names
 from pipelines.io.files import disk_error, replacing
 from pipelines.io.result import Result, load_result
 from pipelines.io.timings import TOTAL, WALL, stage_summaries
+from pipelines.types import Array
 from viz import style
 
 SETTINGS = {
@@ -80,24 +81,53 @@ def _hex(color: style.Color) -> str:
 
 
 def _plot_trajectory(figure: Any, result: Result) -> None:
-    """x to the right and z up: the ground plane of a camera that looks ahead."""
-    axes = figure.subplots()
+    """The ground plane from above, the longer side across; where the truth is known, the error."""
     path = result.Ts_world_camera[:, :3, 3]
-    title = "Camera path from above"
-    if result.gt_Ts_world_camera is not None:
-        assert result.gt_timestamps_s is not None
-        truth = result.gt_Ts_world_camera[:, :3, 3]
-        axes.plot(truth[:, 0], truth[:, 2], color=_hex(style.TRUTH), lw=5, label="ground truth")
-        rows, gt_rows = associate(result.timestamps_s, result.gt_timestamps_s)
-        if len(rows) > 1:
-            errors_m = np.linalg.norm(align(path[rows], truth[gt_rows]) - truth[gt_rows], axis=1)
-            title += f" (ATE {np.sqrt(np.mean(errors_m**2)):.3f} m after alignment)"
-    axes.plot(path[:, 0], path[:, 2], color=_hex(style.ESTIMATE), lw=1.8, label="estimate")
-    axes.plot(*path[0, [0, 2]], "o", color=_hex(style.START), ms=8, label="start")
-    axes.plot(*path[-1, [0, 2]], "o", color=_hex(style.END), ms=8, label="end")
-    axes.set(xlabel="x, to the right (m)", ylabel="z, ahead (m)", title=title)
+    truth = None if result.gt_Ts_world_camera is None else result.gt_Ts_world_camera[:, :3, 3]
+    stamps_s, errors_m = _position_errors(result)
+    if len(errors_m) > 1:
+        axes, below = figure.subplots(2, 1, height_ratios=(3, 1.4))
+        _plot_position_errors(below, stamps_s - result.timestamps_s[0], errors_m)
+    else:
+        axes = figure.subplots()
+    spans = np.ptp(path, axis=0)
+    # A drive ahead would be a thin upright line in a wide, empty picture.
+    across, upward = (2, 0) if spans[2] > spans[0] else (0, 2)
+    if truth is not None:
+        axes.plot(
+            *truth[:, [across, upward]].T, color=_hex(style.TRUTH), lw=5, label="ground truth"
+        )
+    axes.plot(*path[:, [across, upward]].T, color=_hex(style.ESTIMATE), lw=1.8, label="estimate")
+    axes.plot(*path[0, [across, upward]], "o", color=_hex(style.START), ms=8, label="start")
+    axes.plot(*path[-1, [across, upward]], "o", color=_hex(style.END), ms=8, label="end")
+    names = {0: "x, to the right (m)", 2: "z, ahead (m)"}
+    axes.set(xlabel=names[across], ylabel=names[upward], title="Camera path from above")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.legend(loc="best")
+    if across == 2:
+        axes.invert_yaxis()  # looking ahead is to the right here, so the right is downward
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
+
+def _position_errors(result: Result) -> tuple[Array, Array]:
+    """Stamps (N,) and distances (N,) in metres to the truth after alignment; empty without one."""
+    if result.gt_Ts_world_camera is None or result.gt_timestamps_s is None:
+        return np.empty(0), np.empty(0)
+    rows, gt_rows = associate(result.timestamps_s, result.gt_timestamps_s)
+    if len(rows) < 2:
+        return np.empty(0), np.empty(0)
+    truth = result.gt_Ts_world_camera[gt_rows, :3, 3]
+    aligned = align(result.Ts_world_camera[rows, :3, 3], truth)
+    return result.timestamps_s[rows], np.linalg.norm(aligned - truth, axis=1)
+
+
+def _plot_position_errors(axes: Any, seconds: Array, errors_m: Array) -> None:
+    rmse_cm = 100.0 * float(np.sqrt(np.mean(errors_m**2)))
+    axes.plot(seconds, 100.0 * errors_m, ".-", color=_hex(style.ESTIMATE), lw=1.0, ms=4)
+    axes.axhline(rmse_cm, color=_hex(style.INK), lw=1.0, ls="--", label=f"ATE {rmse_cm:.3g} cm")
+    axes.set(xlabel="time (s)", ylabel="off by (cm)", title="Distance to the truth after alignment")
+    axes.margins(y=0.25)
+    axes.set_ylim(bottom=0.0)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def _plot_rpe(figure: Any, result: Result) -> None:
@@ -109,19 +139,22 @@ def _plot_rpe(figure: Any, result: Result) -> None:
     E = relative_errors(result.Ts_world_camera[rows], gt[gt_rows])[consecutive]
     at = gt_rows[1:][consecutive]
     errors = (
-        (1000.0 * np.linalg.norm(E[:, :3, 3], axis=1), "translation (mm)", style.ESTIMATE),
-        (rotation_angle_deg(E), "rotation (deg)", style.END),
+        (1000.0 * np.linalg.norm(E[:, :3, 3], axis=1), "translation", "mm", style.ESTIMATE),
+        (rotation_angle_deg(E), "rotation", "deg", style.END),
     )
     upper, lower = figure.subplots(2, 1, sharex=True)
-    for axes, (values, label, color) in zip((upper, lower), errors, strict=True):
+    for axes, (values, label, unit, color) in zip((upper, lower), errors, strict=True):
         by_frame = np.full(len(stamps), np.nan)  # lost frames leave a gap in the line
         by_frame[at] = values
         axes.plot(by_frame, ".-", color=_hex(color), lw=1.0, ms=4)
         if len(values):
             rmse = float(np.sqrt(np.mean(values**2)))
-            axes.axhline(rmse, color=_hex(style.INK), lw=1.0, ls="--", label=f"RMSE {rmse:.3g}")
+            axes.axhline(
+                rmse, color=_hex(style.INK), lw=1.0, ls="--", label=f"RMSE {rmse:.3g} {unit}"
+            )
             axes.legend(loc="upper right")
-        axes.set(ylabel=label)
+            axes.margins(y=0.25)  # room for the legend
+        axes.set(ylabel=f"{label} ({unit})")
         axes.set_ylim(bottom=0.0)
     upper.set_title("Relative pose error of each step")
     lower.set_xlabel("frame")
@@ -139,9 +172,11 @@ def _plot_timings(figure: Any, result: Result) -> None:
             median_ms, color=_hex(style.INK), lw=1.0, ls="--", label=f"median {median_ms:.1f} ms"
         )
         upper.legend(loc="upper right")
-    upper.set(xlabel="frame", ylabel="ms a frame", title="Wall time")
+        upper.margins(y=0.3)
+    upper.set(xlabel="frame", ylabel="ms a frame", title="Time a frame, reading included")
     upper.set_ylim(bottom=0.0)
-    labels = [name.replace("_", " ") for name in stages]
+    sums = {TOTAL: "all work", WALL: "on the clock"}
+    labels = [sums.get(name, name.replace("_", " ")) for name in stages]
     medians = np.array([values["median_ms"] for values in stages.values()])
     p95 = np.array([values["p95_ms"] for values in stages.values()])
     colors = [_hex(style.INK if name in (TOTAL, WALL) else style.ESTIMATE) for name in stages]

@@ -15,7 +15,7 @@ from viz.style import Color
 SUPERSAMPLING = 2  # drawn so many times larger each way and averaged down
 RIM_SHADE = 0.72  # a splat's rim is this much darker, which keeps light points legible on white
 RIMMED_FROM = 5  # radius in supersampled pixels; a smaller splat would be nothing but rim
-MIN_RADIUS_PX, MAX_RADIUS_PX = 1.5, 7.0  # in a picture 1280 wide
+MIN_RADIUS_PX, MAX_RADIUS_PX = 2.0, 7.0  # in a picture 1280 wide
 
 
 def splat_points(

@@ -16,6 +16,7 @@ TOP_DISTANCE = 60.0  # extents above the map: so far that heights hardly shift a
 FIELD_OF_VIEW_DEG = 55.0  # of the perspective view, across the picture
 ELONGATED = 0.3  # a path this long, against the map's extent, is followed; else the map is viewed
 WIDEST = 0.4  # a path that strays this far aside, against its length, is no way to look along
+OUTSKIRTS = (0.05, 0.95)  # quantiles of the map a side: what is beyond need not be in the picture
 VIEW_NAMES = ("top", "perspective")
 
 
@@ -70,7 +71,7 @@ def _framed(scene: Scene) -> Array:
     """The points that must be in the picture: the path, and the map without its outskirts."""
     if len(scene.points_m) < 20:
         return np.concatenate([scene.path_m, scene.points_m, scene.path_m[:1] + 0.5])
-    low, high = np.quantile(scene.points_m, [0.02, 0.98], axis=0)
+    low, high = np.quantile(scene.points_m, OUTSKIRTS, axis=0)
     inside = ((scene.points_m >= low) & (scene.points_m <= high)).all(1)
     return np.concatenate([scene.path_m, scene.points_m[inside]])
 

@@ -108,6 +108,18 @@ def test_writer_writes_every_nth(tmp_path):
     np.testing.assert_array_equal(read, draw_frame(make_frame(10), make_result(10)))
 
 
+def test_every_nth_is_counted_among_the_frames_of_the_run(tmp_path):
+    writer = FrameWriter(every=2)
+    writer.start(None, 4, None, tmp_path)
+    for k in (1, 4, 7, 10):  # as --start 1 --stride 3 takes them
+        writer.frame(make_frame(k), make_result(k))
+    writer.finish()
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == [
+        "000001.png",
+        "000007.png",
+    ]
+
+
 def test_a_disk_that_refuses_ends_the_pictures_not_the_run(tmp_path, caplog):
     writer = FrameWriter()
     writer.start(None, 5, None, tmp_path)
