@@ -235,6 +235,7 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
 
 
 VIEWS = ("top", "perspective")
+SIZES_PX = (160, 8192)  # smaller pictures hold no text; larger ones no renderer makes
 
 
 def _add_doctor(parser: argparse.ArgumentParser) -> None:
@@ -268,6 +269,11 @@ def _not_negative(text: str) -> int:
 
 def _size(text: str) -> tuple[int, int]:
     width, cross, height = text.lower().partition("x")
-    if not (cross and width.isdecimal() and height.isdecimal() and int(width) * int(height)):
+    if not (cross and width.isdecimal() and height.isdecimal()):
         raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT as in 1280x720, found '{text}'")
+    low, high = SIZES_PX
+    if not all(low <= int(side) <= high for side in (width, height)):
+        raise argparse.ArgumentTypeError(
+            f"expected sides of {low} to {high} pixels, found '{text}'"
+        )
     return int(width), int(height)

@@ -166,6 +166,13 @@ def _can_import(names: Sequence[str]) -> bool:
 
 def data(path: str, dataset: str | None, name: str | None) -> Iterator[Finding]:
     """What of a data folder matters: its layout, what its frames hold, truth."""
+    from app import console
+
+    with console.warnings():
+        yield from _sequence(path, dataset, name)
+
+
+def _sequence(path: str, dataset: str | None, name: str | None) -> Iterator[Finding]:
     from pipelines.datasets import open_sequence
     from pipelines.errors import DyObError
 
@@ -176,12 +183,9 @@ def data(path: str, dataset: str | None, name: str | None) -> Iterator[Finding]:
         return
     camera = sequence.camera
     yield Finding(Verdict.OK, "layout", f"{sequence.dataset}, sequence {sequence.name}")
-    yield Finding(
-        Verdict.OK,
-        "camera",
-        f"{camera.width}x{camera.height}, focal length {camera.fx:.1f} px, "
-        f"baseline {camera.baseline_m * 1000:.0f} mm",
-    )
+    kind = "RGB-D" if camera.is_rgbd else f"baseline {camera.baseline_m * 1000:.0f} mm"
+    words = f"{camera.width}x{camera.height}, focal length {camera.fx:.1f} px, {kind}"
+    yield Finding(Verdict.OK, "camera", words)
     yield _frame_count(sequence)
     if len(sequence) > 0:
         yield from _frames(sequence)

@@ -28,7 +28,8 @@ def run(arguments: Namespace) -> int:
         overrides.append(f"tracking.seed={arguments.seed}")
     config = load_config(arguments.config, overrides)
     options = _simulation_options(arguments)
-    with console.counting("rendering the scene", arguments.quiet) as progress:
+    counting = console.counting("rendering the scene", arguments.quiet)
+    with console.warnings(), counting as progress:
         if _is_simulated(arguments):
             options["progress"] = progress
         sequence = open_sequence(arguments.path, arguments.dataset, arguments.sequence, **options)
@@ -56,7 +57,7 @@ def demo(arguments: Namespace) -> int:
     result = _process(sequence, load_config(), arguments, span)
     if result.metrics["run"]["interrupted"]:
         return INTERRUPTED
-    with console.working("drawing the map and the trajectory", quiet):
+    with console.warnings(), console.working("drawing the map and the trajectory", quiet):
         pictures = render_result(result.folder) + plot_result(result.folder)
     console.pictures(pictures)
     if not quiet:
@@ -91,7 +92,7 @@ def render(arguments: Namespace) -> int:
     from viz.render import render_result
 
     folder = open_result_folder(arguments.result)
-    with console.working(f"drawing {console.shorten(folder)}"):
+    with console.warnings(), console.working(f"drawing {console.shorten(folder)}"):
         pictures = render_result(
             folder,
             size=arguments.size,

@@ -77,7 +77,8 @@ def test_help_imports_nothing_heavy(repository: Path, argv) -> None:
         (["run", "x", "--stride", "-1"], "--stride: expected a whole number, found '-1'"),
         (["run", "x", "--start", "a"], "--start: expected a whole number, found 'a'"),
         (["render", "--size", "1280"], "expected WIDTHxHEIGHT as in 1280x720, found '1280'"),
-        (["render", "--size", "0x720"], "expected WIDTHxHEIGHT"),
+        (["render", "--size", "0x720"], "expected sides of 160 to 8192 pixels"),
+        (["render", "--size", "99999x720"], "expected sides of 160 to 8192 pixels"),
         (["eval", "a", "b"], "'eval' does not know b"),
     ],
 )
