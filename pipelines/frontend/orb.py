@@ -41,6 +41,7 @@ class OrbExtractor:
 
         Depths are left unknown (NaN). At most `n_features`, the strongest of each image cell.
         """
+        self._orb.setNLevels(self._levels_that_fit(gray.shape))
         corners = self._orb.detect(gray, None)  # masking afterwards is faster
         if not corners:
             return Features.empty()
@@ -63,6 +64,15 @@ class OrbExtractor:
             descriptors,
             np.full(len(keypoints), np.nan),
         )
+
+    def _levels_that_fit(self, shape: tuple[int, ...]) -> int:
+        """Levels on which something of an image (H, W) is left between the borders, one at least.
+
+        OpenCV fails where a level shrinks to nothing.
+        """
+        shrinkage = min(shape) / (2 * _BORDER_PX + 1)
+        fitting = 1 + int(np.log(max(shrinkage, 1.0)) / np.log(self.config.scale_factor))
+        return min(self.config.n_levels, fitting)
 
 
 def spread_evenly(

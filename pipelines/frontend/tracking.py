@@ -36,6 +36,7 @@ from pipelines.mapping.sparse_map import SparseMap
 from pipelines.observations import Tracks
 from pipelines.types import Array, MotionHypothesis, TrackingStatus
 
+_GATE = 2.0  # inlier limits: observations farther from the chosen hypothesis adjust it later
 _RELOCALISED_SHARE = 0.5  # of descriptor matches that must agree with a pose found by them
 _RELOCALISE_AGAINST = 5  # latest keyframes tried when lost
 _RELOCALISE_RATIO = 0.8  # of the best to the second best distance (Lowe)
@@ -148,7 +149,8 @@ class Tracker:
         self, sparse_map: SparseMap, tracks: Tracks, T: Array, robust_rounds: int = 2
     ) -> PoseEstimate:
         observations = sparse_map.observe(tracks, self.noise.sigma_disparity_px)
-        return estimate_camera_pose(self.camera, T, observations, robust_rounds)
+        gate_px = _GATE * self.config.inlier_px
+        return estimate_camera_pose(self.camera, T, observations, robust_rounds, gate_px)
 
     # ------------------------------------------------------------ hypotheses
 

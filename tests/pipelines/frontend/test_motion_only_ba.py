@@ -264,3 +264,16 @@ def test_a_guess_with_far_points_behind_it_still_moves():
     )
     assert np.isfinite(estimate.covariance).all() or estimate.n_inliers == 0
     assert error_m_deg(estimate.T_world_camera)[1] < 50  # at least some step was taken
+
+
+def test_a_gate_keeps_a_crowd_that_moves_alike_from_dragging_the_pose():
+    """40 % of the points move together by 10 px: a bus, say, without a mask."""
+    observations = observe(np.random.default_rng(5), 200)
+    uvr = observations.uvr_px.copy()
+    uvr[:80] += [10.0, 0.0, 10.0]
+    moved = replace(observations, uvr_px=uvr)
+    near = T_TRUE @ exp_se3(np.array([0.001, -0.001, 0.0005, 0.01, 0.005, 0.01]))
+    gated = estimate_camera_pose(CAMERA, near, moved, gate_px=4.0)
+    still = estimate_camera_pose(CAMERA, near, observations[np.arange(80, 200)])
+    assert error_m_deg(gated.T_world_camera)[0] < 1.5 * error_m_deg(still.T_world_camera)[0] + 1e-3
+    assert not gated.inliers[:80].any()

@@ -126,3 +126,14 @@ def test_spreading_keeps_all_when_few():
     uv = np.random.default_rng(4).uniform(0, 100, (20, 2))
     np.testing.assert_array_equal(spread_evenly(uv, np.ones(20), (100, 100), 20), np.arange(20))
     assert len(spread_evenly(uv[:0], np.ones(0), (100, 100), 5)) == 0
+
+
+@pytest.mark.parametrize(("n_levels", "scale_factor"), [(16, 4.0), (16, 2.0), (8, 1.2)])
+@pytest.mark.parametrize("size", [(H, W), (60, 90), (39, 39), (20, 20)])
+def test_more_levels_than_an_image_has_room_for_are_left_out(n_levels, scale_factor, size):
+    gray = textured()[: size[0], : size[1]].copy()
+    config = OrbConfig(n_features=500, n_levels=n_levels, scale_factor=scale_factor)
+    features = OrbExtractor(config).extract(gray)
+    assert features.octave.max(initial=0) < n_levels
+    if size == (H, W):
+        assert len(features) == 500
