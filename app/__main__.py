@@ -56,7 +56,8 @@ def main(argv):
 def _fault_of_the_machine(error):
     """A sentence for an error that nobody can mend in the code, else None."""
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-        return "the disk is full (%s): make room and start again" % (error.filename or "?")
+        where = " (%s)" % error.filename if error.filename else ""
+        return "the disk is full%s: make room and start again" % where
     if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EROFS):
         return "no permission to use %s: choose another place" % (error.filename or "a file")
     if isinstance(error, MemoryError):

@@ -7,6 +7,7 @@ pipe. Results go to stdout, progress and warnings to stderr.
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -18,14 +19,29 @@ from rich.console import Console
 from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
-from rich.table import Table
 from rich.text import Text
 
 PLAIN_EVERY_S = 5.0  # between progress lines where there is no terminal
 PROGRAM = "python3 -m app"
 
-stdout = Console()
-stderr = Console(stderr=True)
+
+class _Output(Console):
+    """stdout, whose closed pipe ends the program in `app.__main__`, not in the middle of rich."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError
+
+
+class _Remarks(Console):
+    """stderr: where nobody reads it any more, the work goes on in silence."""
+
+    def on_broken_pipe(self) -> None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+        self.quiet = True
+
+
+stdout: Console = _Output()
+stderr: Console = _Remarks(stderr=True)
 
 
 class Progress:
@@ -156,20 +172,12 @@ def metrics(metrics: dict[str, Any], timings: dict[str, Any], folder: str) -> No
 _PLAIN: dict[str, Any] = {"highlight": False, "markup": False, "soft_wrap": True}
 
 
-def rows(cells: Iterable[tuple[str, ...]], styles: tuple[str, ...] = ()) -> None:
-    """Aligned columns without borders, the last one wrapped on a terminal."""
-    table = Table.grid(padding=(0, 2))
+def rows(cells: Iterable[tuple[str, ...]]) -> None:
+    """Aligned columns without borders, never wrapped: a command must stay whole to be copied."""
     cells = [tuple(row) for row in cells]
-    if not stdout.is_terminal:
-        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-        for row in cells:
-            line = "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True))
-            stdout.print(line.rstrip(), **_PLAIN)
-        return
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     for row in cells:
-        padded = (*styles, *("",) * (len(row) - len(styles)))
-        table.add_row(*(Text(c, style=s) for c, s in zip(row, padded, strict=True)))
-    stdout.print(table)
+        say("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip())
 
 
 def pictures(files: Iterable[Path]) -> None:

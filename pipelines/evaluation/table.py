@@ -24,7 +24,7 @@ SINGLE_ROWS = (
     ("kitti_t_rel_percent", "KITTI t_rel (100-800 m)", "%", 3),
     ("kitti_r_rel_deg_per_100m", "KITTI r_rel (100-800 m)", "deg in 100 m", 3),
 )
-TIMING_LABELS = {TOTAL: "all work, part of it ahead", WALL: "on the clock, with reading"}
+TIMING_LABELS = {TOTAL: "all work, in two threads", WALL: "on the clock, with reading"}
 HYPOTHESES = {"pnp_ransac": "PnP RANSAC", "rgbd_odometry": "RGB-D odometry"}
 
 

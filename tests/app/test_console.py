@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import io
 import logging
+import os
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -95,6 +98,54 @@ def test_warnings_are_shown_inside_the_block_only(screen, capsys) -> None:
     assert "frame 3 cannot be read" in said
     assert "nothing to see" not in said
     assert logging.getLogger("dyob").handlers == []
+
+
+class _Closed(io.StringIO):
+    """A pipe whose reader is gone."""
+
+    def write(self, text: str) -> int:
+        raise BrokenPipeError
+
+
+def test_a_closed_stdout_ends_the_program_by_its_own_error(monkeypatch) -> None:
+    monkeypatch.setattr(console, "stdout", type(console.stdout)(file=_Closed()))
+    with pytest.raises(BrokenPipeError):
+        console.say("a line")
+
+
+@pytest.mark.parametrize("verb", ["config", "datasets"])
+def test_a_reader_that_leaves_early_is_no_error(verb: str) -> None:
+    child = subprocess.Popen(
+        [sys.executable, "-m", "app", verb],
+        cwd=Path(__file__).resolve().parents[2],
+        env={**os.environ, "DYOB_NO_SETUP": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert child.stdout is not None
+    child.stdout.close()
+    _, said = child.communicate()
+    assert (child.returncode, said) == (0, b"")
+
+
+def test_remarks_that_nobody_reads_do_not_end_the_work() -> None:
+    """In a child, since its stderr is closed for good."""
+    program = (
+        "from app import console\n"
+        "for k in range(3): console.stderr.print('remark', k)\n"
+        "console.say('done')\n"
+    )
+    child = subprocess.Popen(
+        [sys.executable, "-c", program],
+        cwd=Path(__file__).resolve().parents[2],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stderr is not None
+    child.stderr.close()
+    said, _ = child.communicate()
+    assert (child.returncode, said) == (0, "done\n")
 
 
 def test_paths_are_shortened_inside_the_working_folder(tmp_path: Path, monkeypatch) -> None:
