@@ -9,9 +9,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from app import cli
+from pipelines.datasets import open_sequence
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -33,6 +36,21 @@ def test_the_script_runs(tmp_path: Path) -> None:
     first, second = done.stdout.splitlines()
     assert 0 < float(first.split()[-1]) < 0.01
     assert second == "(40, 4, 4)"
+
+
+def test_the_example_of_own_data_opens(tmp_path: Path) -> None:
+    (yaml,) = re.findall(r"```yaml\n(.*?)```", README, re.DOTALL)
+    (tmp_path / "camera.yaml").write_text(yaml, encoding="utf-8")
+    for folder, pixel in (("images", np.uint8), ("depth", np.uint16)):
+        (tmp_path / folder).mkdir()
+        image = np.full((480, 640), 200, pixel)
+        assert all(cv2.imwrite(str(tmp_path / folder / f"{k:06d}.png"), image) for k in range(2))
+    sequence = open_sequence(tmp_path)
+    frame = sequence.read(1)
+    assert (sequence.dataset, sequence.camera.is_rgbd) == ("folder", True)
+    assert sequence.timestamps_s[1] == pytest.approx(1 / 30)
+    assert frame.depth_m is not None
+    assert np.allclose(frame.depth_m, 0.2)
 
 
 def test_there_are_commands() -> None:
