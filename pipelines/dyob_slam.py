@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pipelines.config import Config
 from pipelines.depth import StereoDepth
+from pipelines.errors import FrameError
 from pipelines.frontend.orb import OrbExtractor
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame, Tracker
@@ -77,7 +78,9 @@ class DyObSlam:
         """The part of a frame's work that depends on no other frame; it may run ahead of `process`.
 
         Frames may be prepared in one thread while another processes; the answers are the same.
+        Raises FrameError for an image that is not of the camera's size.
         """
+        _check_size(self.camera, frame)
         begin = time.perf_counter()
         # 0. Depth, given or by stereo
         depth_m = self._depth(frame)
@@ -174,3 +177,12 @@ class DyObSlam:
         finally:
             spent = 1e3 * (time.perf_counter() - begin)
             self._timings_ms[name] = self._timings_ms.get(name, 0.0) + spent
+
+
+def _check_size(camera: StereoCamera, frame: Frame) -> None:
+    height, width = frame.image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise FrameError(
+            f"expected an image of {camera.width} x {camera.height}, found {width} x {height}; "
+            "all images of a sequence must have the calibrated size"
+        )

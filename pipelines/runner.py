@@ -172,9 +172,7 @@ def _prepare_ahead(
     """Frames in order, the next being read and prepared while the present one is processed."""
 
     def prepare(index: int) -> PreparedFrame:
-        frame = sequence.read(index)
-        _check_size(sequence, frame)
-        return slam.prepare(frame)
+        return slam.prepare(sequence.read(index))
 
     with ThreadPoolExecutor(1, thread_name_prefix="prepare") as ahead:
         pending = ahead.submit(prepare, indices[0])
@@ -183,16 +181,6 @@ def _prepare_ahead(
             if position + 1 < len(indices):
                 pending = ahead.submit(prepare, indices[position + 1])
             yield index, current
-
-
-def _check_size(sequence: Sequence, frame: Frame) -> None:
-    camera = sequence.camera
-    height, width = frame.image.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        raise FrameError(
-            f"expected an image of {camera.width} x {camera.height}, found {width} x {height}; "
-            "all images of a sequence must have the calibrated size"
-        )
 
 
 def _write(writer: ResultWriter, sequence: Sequence, slam: DyObSlam, progress: _Progress) -> None:

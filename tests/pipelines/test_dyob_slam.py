@@ -16,6 +16,7 @@ from pipelines.config import load_config
 from pipelines.datasets import open_sequence
 from pipelines.datasets.sequence import Sequence
 from pipelines.dyob_slam import DyObSlam
+from pipelines.errors import FrameError
 from pipelines.evaluation import evaluate_camera
 from pipelines.geometry import invert_T
 from pipelines.types import (
@@ -402,3 +403,11 @@ def _collect(item: Any, seen: dict[int, Any]) -> None:
     for child in inner:
         if type(child).__name__ != "module":
             _collect(child, seen)
+
+
+def test_an_image_of_another_size_than_the_cameras_is_refused(street) -> None:
+    frame = street.read(0)
+    half = Frame(0, 0.0, frame.image[::2, ::2].copy())
+    height, width = half.image.shape[:2]
+    with pytest.raises(FrameError, match=f"found {width} x {height}"):
+        DyObSlam(street.camera).process(half)
