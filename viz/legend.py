@@ -50,10 +50,17 @@ def title_lines(result: Result) -> list[str]:
     lines.append(",  ".join(facts))
     if camera.get("ate_rmse_m") is not None and camera.get("rpe_trans_rmse_m") is not None:
         lines.append(
-            f"ATE {100 * camera['ate_rmse_m']:.2f} cm,  RPE {100 * camera['rpe_trans_rmse_m']:.2f} "
-            f"cm and {camera['rpe_rot_rmse_deg']:.3f}° a frame"
+            f"ATE {digits(100 * camera['ate_rmse_m'])} cm,  "
+            f"RPE {digits(100 * camera['rpe_trans_rmse_m'])} cm and "
+            f"{digits(camera['rpe_rot_rmse_deg'])}° a frame"
         )
     return lines
+
+
+def digits(value: float) -> str:
+    """A positive number with three digits that count, never as a power of ten."""
+    power = int(np.floor(np.log10(value))) if value > 0 else 0
+    return f"{value:.{int(np.clip(2 - power, 0, 6))}f}"
 
 
 def _sizes(view: View) -> tuple[int, int]:
@@ -131,6 +138,10 @@ def _draw_ends(picture: Image, scene: Scene, view: View, panel: Any, dark: bool)
 
     text_px, _ = _sizes(view)
     ends = (("end", scene.path_m[-1:], style.END), ("start", scene.path_m[:1], style.START))
+    apart_px = view.project(scene.path_m[-1:])[0][0] - view.project(scene.path_m[:1])[0][0]
+    # Words of ends that are close go to different sides, or one would lie under the other's disc.
+    are_close = abs(apart_px[0]) < 3.5 * text_px and abs(apart_px[1]) < 3.0 * text_px
+    above = ("end" if apart_px[1] < 0 else "start") if are_close else ""
     for word, point, plain_color in ends:
         color = style.on_dark(plain_color) if dark else plain_color
         uv, depth = view.project(point)
@@ -143,7 +154,7 @@ def _draw_ends(picture: Image, scene: Scene, view: View, panel: Any, dark: bool)
         width = style.text_size(word, text_px, 600)[0]
         left = int(np.clip(u - width // 2, 2, max(view.size[0] - width - 2, 2)))
         base = v + r + round(1.25 * text_px)
-        if base + text_px // 3 > view.size[1]:
+        if word == above or base + text_px // 3 > view.size[1]:
             base = v - r - round(0.5 * text_px)
         pad = text_px // 4
         style.draw_panel(

@@ -84,7 +84,7 @@ def _render_job(folder: Path) -> None:
     size = tuple(int(n) for n in job["size"])
     W, H = (SUPERSAMPLING * n for n in size)
     renderer = rendering.OffscreenRenderer(W, H)
-    renderer.scene.set_background([*job["background"], 1.0])
+    renderer.scene.set_background([*_encoded(job["background"]), 1.0])
     renderer.scene.view.set_post_processing(False)  # tone mapping turns white into cream
     material = rendering.MaterialRecord()
     material.shader = "defaultUnlit"
@@ -101,6 +101,11 @@ def _render_job(folder: Path) -> None:
         large = np.asarray(renderer.render_to_image())[..., :3]
         pictures.append(cv2.resize(large, size, interpolation=cv2.INTER_AREA))
     np.save(folder / "pictures.npy", np.array(pictures))
+
+
+def _encoded(color: Array) -> Array:
+    """What Open3D must be told for a ground of `color`: it takes sRGB and writes linear values."""
+    return np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1 / 2.4) - 0.055)
 
 
 def _disc_mesh(points_m: Array, colors: NDArray[np.float32], view: View, radius_m: float) -> Any:

@@ -9,7 +9,7 @@ from pipelines.geometry import exp_se3
 from pipelines.io.result import ResultWriter
 from pipelines.types import FrameResult, GroundTruth, MotionHypothesis, StaticMap, TrackingStatus
 from viz import offscreen, style
-from viz.legend import scale_bar_m
+from viz.legend import digits, scale_bar_m
 from viz.lines import draw_polyline
 from viz.render import render_result
 from viz.scene import Polyline, View, build_scene
@@ -106,6 +106,24 @@ def test_dark_background(folder):
     picture = read(paths[0])
     assert np.median(picture) < 30
     assert share_of(picture, (90, 180, 255)) > 5e-4
+
+
+@pytest.mark.parametrize("renderer", ["open3d", "splat"])
+def test_the_dark_ground_is_the_same_by_every_renderer(folder, renderer, caplog):
+    path = render_result(
+        folder, size=SIZE, background="black", renderer=renderer, views=("perspective",)
+    )[0]
+    if "Open3D cannot render" in caplog.text:
+        pytest.skip("no Vulkan driver on this machine")
+    assert share_of(read(path), style.BACKGROUNDS["black"], 4) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [(0.0, "0.00"), (0.0000924, "0.000092"), (0.0598, "0.0598"), (3.274, "3.27"), (512.3, "512")],
+)
+def test_small_errors_keep_their_digits(value, words):
+    assert digits(value) == words
 
 
 def test_a_run_with_nothing_in_it_still_has_pictures(tmp_path):
