@@ -58,18 +58,24 @@ def estimate_camera_pose(
     T_world_camera: Array,
     observations: StereoObservations,
     robust_rounds: int = 2,
+    gate_px: float = np.inf,
 ) -> PoseEstimate:
     """Camera pose that minimises the reprojection error, eq. (1), from an initial guess.
 
     Huber's kernel on Mahalanobis distances, then chi-square rejection (95 %), `robust_rounds` times
     (one will do from a good guess), and a last solution of the inliers alone. The weight of an
     observation is the inverse of its pixel noise plus its point's uncertainty seen in the image,
-    which eliminates the points exactly to first order.
+    which eliminates the points exactly to first order. Observations more than `gate_px` from the
+    guess join after the first round: many that move alike would drag even a robust cost along.
     """
-    used = np.ones(len(observations), bool)
     T = T_world_camera
-    for _ in range(robust_rounds):
-        problem = _Problem(camera, T, observations)
+    problem = _Problem(camera, T, observations)
+    used = np.abs(problem.residuals(T)[:, :2]).max(axis=1, initial=0.0) <= gate_px
+    if used.sum() < _MIN_POINTS:
+        used[:] = True
+    for round_index in range(robust_rounds):
+        if round_index > 0:
+            problem = _Problem(camera, T, observations)
         T = problem.minimise(T, used, robust=True)
         problem.allow_for_noise(T)
         used = problem.chi2(T) <= problem.limit
