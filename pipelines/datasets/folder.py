@@ -34,7 +34,7 @@ LISTS = ("associations.txt", "associate.txt", "rgb.txt")  # of tum_rgbd
 
 
 class FolderSequence(FileSequence):
-    """Images in order of their numbers, with files of the same stem for everything else."""
+    """Own recordings: images in order of their numbers, all else in files of the same stem."""
 
     dataset = "folder"
     layout = (
