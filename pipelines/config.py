@@ -155,7 +155,7 @@ def _read_settings(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ConfigError(
             f"cannot read the settings file {path}: {error.strerror}; "
-            "give --config a YAML file such as `python -m app config` prints"
+            "give --config a YAML file such as `python3 -m app config` prints"
         ) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         first_line = " ".join(str(error).split())

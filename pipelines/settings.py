@@ -63,7 +63,7 @@ def _unknown_key(key: str, root: type) -> str:
     near = near or get_close_matches(key, valid, 1, 0.0)
     return (
         f"unknown setting '{key}'; the nearest valid one is '{near[0]}' "
-        "(`python -m app config` lists all)"
+        "(`python3 -m app config` lists all)"
     )
 
 
