@@ -72,13 +72,20 @@ class TrackingConfig:
     weak_inlier_share: float = 0.5  # below it dense odometry, then relocalisation joins in
     min_inliers: int = 20  # fewer than this after bundle adjustment is LOST; also to start with
     min_inlier_share: float = 0.1  # so is a smaller share of the points measured
+    min_regained_share: float = 0.4  # the same after a LOST frame, far from where motion led
     restart_after_frames: int = 5  # LOST frames with features before tracking starts anew
     use_rgbd_odometry: bool = True  # Open3D's dense odometry as the third hypothesis
 
     def __post_init__(self) -> None:
         _check(self, seed=(0, 2**31 - 1), search_radius_px=(1, 500), flow_tolerance_px=(0, 100))
         _check(self, map_radius_px=(1, 100), max_hamming=(0, 256), inlier_px=(0.1, 50))
-        _check(self, weak_inlier_share=(0, 1), min_inlier_share=(0, 1), min_inliers=(6, _ANY))
+        _check(
+            self,
+            weak_inlier_share=(0, 1),
+            min_inlier_share=(0, 1),
+            min_regained_share=(0, 1),
+            min_inliers=(6, _ANY),
+        )
         _check(self, restart_after_frames=(1, _ANY))
 
 

@@ -37,6 +37,7 @@ from pipelines.observations import Tracks
 from pipelines.types import Array, MotionHypothesis, TrackingStatus
 
 _GATE = 2.0  # inlier limits: observations farther from the chosen hypothesis adjust it later
+_REGAINED_NEAR = 0.5  # of the way predicted since the last good frame, to be about there
 _RELOCALISED_SHARE = 0.5  # of descriptor matches that must agree with a pose found by them
 _RELOCALISE_AGAINST = 5  # latest keyframes tried when lost
 _RELOCALISE_RATIO = 0.8  # of the best to the second best distance (Lowe)
@@ -106,8 +107,7 @@ class Tracker:
             return self._lost(T_predicted, measured.tracks)
         with stage("pose"):
             estimate = self._adjust(sparse_map, measured.tracks, T)
-        share = estimate.n_inliers / len(measured.tracks)
-        if estimate.n_inliers < self.config.min_inliers or share < self.config.min_inlier_share:
+        if not self._is_trusted(estimate, T_predicted):
             return self._lost(T_predicted, measured.tracks)
         first = not self.noise.is_learned
         self._learn_noise(sparse_map, measured, estimate)
@@ -120,6 +120,8 @@ class Tracker:
             if len(found):
                 tracks = Tracks.concatenate(tracks, found)
                 estimate = self._adjust(sparse_map, tracks, T, robust_rounds=1)
+                if not self._is_trusted(estimate, T_predicted):
+                    return self._lost(T_predicted, tracks)
                 self._learn_orb_noise(estimate, len(measured.tracks))
         pixels = estimate.residuals_px[estimate.inliers][:, :2]
         return TrackedFrame(
@@ -132,6 +134,21 @@ class Tracker:
             float(np.sqrt((pixels**2).sum(1).mean())) if len(pixels) else np.nan,
             visible,
         )
+
+    def _is_trusted(self, estimate: PoseEstimate, T_predicted: Array) -> bool:
+        """Whether enough points agree with a pose.
+
+        After a lost frame any place may be in sight, and places look alike: more must agree then,
+        unless the pose is about where the motion led.
+        """
+        assert self._last is not None and self.motion is not None
+        share = self.config.min_inlier_share
+        if not self._last.flow_starts_here:
+            led_m = T_predicted[:3, 3] - self.motion.T_world_camera[:3, 3]
+            off_m = T_predicted[:3, 3] - estimate.T_world_camera[:3, 3]
+            if np.linalg.norm(off_m) > _REGAINED_NEAR * np.linalg.norm(led_m):
+                share = self.config.min_regained_share
+        return estimate.n_inliers >= max(self.config.min_inliers, share * len(estimate.inliers))
 
     def _lost(self, T_predicted: Array, tracks: Tracks) -> TrackedFrame:
         return TrackedFrame(
