@@ -120,10 +120,66 @@ class MappingConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class DetectorConfig:
+    """Step 1: instance masks of movable things."""
+
+    # auto: files where the sequence has masks, else yolo_seg or mask_rcnn where its model is at
+    # hand, else motion; or one of files, yolo_seg, mask_rcnn, motion
+    name: str = "auto"
+    model: str = ""  # path of the network's ONNX file, empty = where `models fetch` puts it
+    every_n: int = 1  # the network runs on every n-th frame; between, masks are carried by flow
+    min_score: float = 0.35  # detections below are dropped
+    max_instances: int = 100  # the best are kept
+    input_width_px: int = 0  # px, images are scaled to this width for the network, 0 = its own
+    threads: int = 2  # of the network on the CPU
+    # movable classes, by their COCO names; masks of other classes are not used
+    classes: tuple[str, ...] = (
+        "person",
+        "bicycle",
+        "car",
+        "motorcycle",
+        "bus",
+        "train",
+        "truck",
+        "boat",
+        "bird",
+        "cat",
+        "dog",
+        "horse",
+        "sheep",
+        "cow",
+        "sports ball",
+        "chair",
+        "suitcase",
+    )
+
+    def __post_init__(self) -> None:
+        _check(self, every_n=(1, 1000), min_score=(0, 1), max_instances=(1, 1000))
+        _check(self, input_width_px=(0, 8192), threads=(1, 256))
+
+
+@dataclass(frozen=True, slots=True)
+class FlowConfig:
+    """Step 2: dense optical flow from the previous frame."""
+
+    # auto: files where the sequence has flow, else dis; or one of files, dis, pwc_net
+    name: str = "auto"
+    preset: str = "medium"  # of dis: ultrafast, fast, medium
+    check: bool = False  # also compute the flow back, and drop what does not return
+    max_miss_px: float = 1.0  # px, of the check
+    model: str = ""  # of pwc_net: path of the weights, empty = where `models fetch` puts them
+
+    def __post_init__(self) -> None:
+        _check(self, max_miss_px=(0.01, 100))
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """The whole system's settings."""
 
     depth: DepthConfig = field(default_factory=DepthConfig)
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    flow: FlowConfig = field(default_factory=FlowConfig)
     orb: OrbConfig = field(default_factory=OrbConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)

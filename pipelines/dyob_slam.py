@@ -166,7 +166,7 @@ class DyObSlam:
             tracked.tracks.point_ids,
             tracked.inliers,
             tracked.rmse_px,
-            self._timings_ms,
+            timings_ms=self._timings_ms,
         )
 
     @contextmanager

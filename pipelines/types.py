@@ -1,6 +1,7 @@
 """The nouns that the steps of the system hand to each other: frozen bundles of numpy arrays.
 
-Owns shapes, units and frames of the data. Imports numpy alone, and knows no algorithm.
+Owns shapes, units and frames of the data; those of moving objects are in `object_types`. Imports
+numpy alone, and knows no algorithm.
 
 Conventions: `T_world_camera` is 4x4 float64 with `p_world = T_world_camera @ p_camera`; camera axes
 are OpenCV's (x right, y down, z forward); the world is the first camera; pixels are (u, v) with the
@@ -16,18 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.object_types import ObjectEstimates
+from pipelines.shapes import check_shape
+
 Array = NDArray[np.floating[Any]]
 Image = NDArray[np.uint8]
-
-
-def _check_shape(owner: str, name: str, array: NDArray, expected: tuple[int | None, ...]) -> None:
-    """Raise ValueError unless `array` has `expected` shape; None stands for any size."""
-    ok = array.ndim == len(expected) and all(
-        want is None or have == want for have, want in zip(array.shape, expected, strict=True)
-    )
-    if not ok:
-        wanted = ", ".join("any" if n is None else str(n) for n in expected)
-        raise ValueError(f"{owner}.{name}: expected shape ({wanted}), found {array.shape}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +68,7 @@ class Frame:
         this sequence, pointing into this one; NaN where unknown, or None.
     instance_labels: (H, W) int32, 0 = background, > 0 = instances of movable classes as they come
         with the sequence; labels need not be the same from frame to frame. None if there are none.
+    instance_classes: class name of some or all labels, None where the sequence does not say.
     """
 
     index: int
@@ -83,6 +78,7 @@ class Frame:
     depth_m: NDArray[np.float32] | None = None
     flow_prev_to_curr_px: NDArray[np.float32] | None = None
     instance_labels: NDArray[np.int32] | None = None
+    instance_classes: dict[int, str] | None = None
 
     def __post_init__(self) -> None:
         if self.image.ndim not in (2, 3) or self.image.dtype != np.uint8:
@@ -92,13 +88,13 @@ class Frame:
             )
         H, W = self.image.shape[:2]
         if self.image_right is not None:
-            _check_shape("Frame", "image_right", self.image_right, self.image.shape)
+            check_shape("Frame", "image_right", self.image_right, self.image.shape)
         if self.depth_m is not None:
-            _check_shape("Frame", "depth_m", self.depth_m, (H, W))
+            check_shape("Frame", "depth_m", self.depth_m, (H, W))
         if self.flow_prev_to_curr_px is not None:
-            _check_shape("Frame", "flow_prev_to_curr_px", self.flow_prev_to_curr_px, (H, W, 2))
+            check_shape("Frame", "flow_prev_to_curr_px", self.flow_prev_to_curr_px, (H, W, 2))
         if self.instance_labels is not None:
-            _check_shape("Frame", "instance_labels", self.instance_labels, (H, W))
+            check_shape("Frame", "instance_labels", self.instance_labels, (H, W))
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,9 +116,9 @@ class ObjectTruth:
     def __post_init__(self) -> None:
         M = len(self.frame_index)
         for name in ("frame_index", "object_id", "class_name", "moving"):
-            _check_shape("ObjectTruth", name, getattr(self, name), (M,))
-        _check_shape("ObjectTruth", "Ts_world_object", self.Ts_world_object, (M, 4, 4))
-        _check_shape("ObjectTruth", "boxes_px", self.boxes_px, (M, 4))
+            check_shape("ObjectTruth", name, getattr(self, name), (M,))
+        check_shape("ObjectTruth", "Ts_world_object", self.Ts_world_object, (M, 4, 4))
+        check_shape("ObjectTruth", "boxes_px", self.boxes_px, (M, 4))
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -142,8 +138,8 @@ class GroundTruth:
 
     def __post_init__(self) -> None:
         N = len(self.timestamps_s)
-        _check_shape("GroundTruth", "timestamps_s", self.timestamps_s, (N,))
-        _check_shape("GroundTruth", "Ts_world_camera", self.Ts_world_camera, (N, 4, 4))
+        check_shape("GroundTruth", "timestamps_s", self.timestamps_s, (N,))
+        check_shape("GroundTruth", "Ts_world_camera", self.Ts_world_camera, (N, 4, 4))
 
 
 class TrackingStatus(StrEnum):
@@ -185,10 +181,10 @@ class Features:
 
     def __post_init__(self) -> None:
         N = len(self.uv_px)
-        _check_shape("Features", "uv_px", self.uv_px, (N, 2))
+        check_shape("Features", "uv_px", self.uv_px, (N, 2))
         for name in ("octave", "angle_deg", "response", "depth_m"):
-            _check_shape("Features", name, getattr(self, name), (N,))
-        _check_shape("Features", "descriptors", self.descriptors, (N, 32))
+            check_shape("Features", name, getattr(self, name), (N,))
+        check_shape("Features", "descriptors", self.descriptors, (N, 32))
 
     def __len__(self) -> int:
         return len(self.uv_px)
@@ -226,6 +222,8 @@ class FrameResult:
         points; -1 would stand for a keypoint of none. inliers: (N,) bool, whether the observation
         agreed with the pose.
     reprojection_rmse_px: of the inliers' pixels (u_L, v), NaN where there are none.
+    objects: rows of all objects that are being tracked. object_labels: (H, W) int32, pixels of each
+        by its lasting id, 0 elsewhere; None where there are no objects.
     timings_ms: time of each stage of this frame; "total", their sum; in a run also "wall", the time
         since the result before this one, which is less as frames are prepared ahead.
     """
@@ -241,15 +239,17 @@ class FrameResult:
     point_ids: NDArray[np.int64]
     inliers: NDArray[np.bool_]
     reprojection_rmse_px: float
+    objects: ObjectEstimates = field(default_factory=ObjectEstimates.empty)
+    object_labels: NDArray[np.int32] | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         N = len(self.keypoints_px)
-        _check_shape("FrameResult", "T_world_camera", self.T_world_camera, (4, 4))
-        _check_shape("FrameResult", "pose_covariance", self.pose_covariance, (6, 6))
-        _check_shape("FrameResult", "keypoints_px", self.keypoints_px, (N, 2))
-        _check_shape("FrameResult", "point_ids", self.point_ids, (N,))
-        _check_shape("FrameResult", "inliers", self.inliers, (N,))
+        check_shape("FrameResult", "T_world_camera", self.T_world_camera, (4, 4))
+        check_shape("FrameResult", "pose_covariance", self.pose_covariance, (6, 6))
+        check_shape("FrameResult", "keypoints_px", self.keypoints_px, (N, 2))
+        check_shape("FrameResult", "point_ids", self.point_ids, (N,))
+        check_shape("FrameResult", "inliers", self.inliers, (N,))
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,10 +269,10 @@ class StaticMap:
 
     def __post_init__(self) -> None:
         N, K = len(self.points_m), len(self.keyframe_indices)
-        _check_shape("StaticMap", "points_m", self.points_m, (N, 3))
-        _check_shape("StaticMap", "colors", self.colors, (N, 3))
-        _check_shape("StaticMap", "n_observations", self.n_observations, (N,))
-        _check_shape(
+        check_shape("StaticMap", "points_m", self.points_m, (N, 3))
+        check_shape("StaticMap", "colors", self.colors, (N, 3))
+        check_shape("StaticMap", "n_observations", self.n_observations, (N,))
+        check_shape(
             "StaticMap", "keyframe_Ts_world_camera", self.keyframe_Ts_world_camera, (K, 4, 4)
         )
 

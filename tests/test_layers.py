@@ -74,8 +74,14 @@ def test_imports_go_down_the_layers(file: Path) -> None:
         assert top not in ("tests", "notebooks"), f"imports {module}"
 
 
-def test_types_import_numpy_alone() -> None:
-    tops = {module.split(".")[0] for module in imports(parse(ROOT / "pipelines/types.py"))}
+NOUNS = ("types", "object_types", "shapes")
+
+
+@pytest.mark.parametrize("name", NOUNS)
+def test_types_import_numpy_and_each_other_alone(name: str) -> None:
+    modules = set(imports(parse(ROOT / f"pipelines/{name}.py")))
+    modules -= {f"pipelines.{noun}" for noun in NOUNS}
+    tops = {module.split(".")[0] for module in modules}
     assert tops - set(sys.stdlib_module_names) == {"numpy"}
 
 
