@@ -366,6 +366,7 @@ def test_frames_have_no_room_for_truth() -> None:
         "depth_m",
         "flow_prev_to_curr_px",
         "instance_labels",
+        "instance_classes",
     }
 
 

@@ -58,7 +58,7 @@ def test_frame_has_no_room_for_truth():
     names = {f.name for f in fields(Frame)}
     assert names == {
         "index", "timestamp_s", "image", "image_right", "depth_m", "flow_prev_to_curr_px",
-        "instance_labels",
+        "instance_labels", "instance_classes",
     }  # fmt: skip
 
 
