@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 from pipelines.errors import ConfigError
 from pipelines.settings import build, describe, merge, to_plain
@@ -174,6 +174,41 @@ class FlowConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class ObjectsConfig:
+    """Steps 5, 7, 8 and 9: which objects there are, which of them move, how, and how fast."""
+
+    enabled: bool = True  # false: movable things are masked for the camera and nothing more
+    max_points: int = 200  # tracked points of one object
+    min_points: int = 12  # fewer that agree with a motion do not prove it
+    min_inlier_share: float = 0.4  # nor does a smaller share of the points measured
+    max_depth_m: float = (
+        25.0  # m, ThDepthObj (VDO-SLAM, KITTI): motions beyond are not told, 0 = any
+    )
+    max_speed_std_mps: float = 1.5  # m/s, a less certain speed is not reported
+    max_turn_std_deg: float = 1.0  # deg a frame, nor is a motion whose turn is less certain
+    # speed: in m/s against its own uncertainty; scene_flow: the paper's threshold in m a frame
+    motion_rule: Literal["speed", "scene_flow"] = "speed"
+    min_speed_mps: float = 0.3  # m/s, slower is still; the speed of turning counts as well
+    significance: float = 3.0  # standard deviations above that to be moving
+    scene_flow_m: float = 0.12  # m a frame, a point with more scene flow moves (VDO-SLAM, KITTI)
+    scene_flow_share: float = 0.3  # still points above which an object is still (VDO-SLAM, KITTI)
+    still_after_s: float = 1.0  # s, a thing still for so long serves the camera as landmark
+    max_carried_s: float = 0.5  # s, a mask is carried by flow so long without a detection
+    max_age_s: float = 3.0  # s, an object out of sight so long is forgotten
+    acceleration_mps2: float = 3.0  # m/s^2, how fast objects change their speed (process noise)
+    turn_radps2: float = 1.0  # rad/s^2, and how fast their turning
+
+    def __post_init__(self) -> None:
+        _check(self, max_points=(6, 5000), min_points=(6, 1000), min_inlier_share=(0, 1))
+        _check(self, max_depth_m=(0, _ANY), max_speed_std_mps=(0.001, _ANY))
+        _check(self, max_turn_std_deg=(0.001, 180))
+        _check(self, min_speed_mps=(0, _ANY), significance=(0, 100))
+        _check(self, scene_flow_m=(0, _ANY), scene_flow_share=(0, 1), still_after_s=(0, _ANY))
+        _check(self, max_carried_s=(0, _ANY), max_age_s=(0, _ANY))
+        _check(self, acceleration_mps2=(0.01, _ANY), turn_radps2=(0.01, _ANY))
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """The whole system's settings."""
 
@@ -183,6 +218,7 @@ class Config:
     orb: OrbConfig = field(default_factory=OrbConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
+    objects: ObjectsConfig = field(default_factory=ObjectsConfig)
 
 
 def load_config(path: str | Path | None = None, overrides: Iterable[str] = ()) -> Config:

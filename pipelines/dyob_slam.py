@@ -24,6 +24,8 @@ from pipelines.frontend.tracking import TrackedFrame, Tracker
 from pipelines.frontend.view import PreparedFrame, View, complete_view, prepare_frame
 from pipelines.mapping.local_mapping import LocalMapping
 from pipelines.mapping.sparse_map import SparseMap
+from pipelines.object_types import Detections
+from pipelines.objects.tracking import ObjectTracker
 from pipelines.observations import Tracks
 from pipelines.types import (
     Array,
@@ -52,6 +54,7 @@ class DyObSlam:
         self.sensor = Sensor(camera, self.config.depth)
         self._tracker = Tracker(self.sensor, self.config.tracking)
         self._mapping = LocalMapping(self.sensor, self.config.mapping, self.config.orb)
+        self._objects = ObjectTracker(self.sensor, self.config.objects)
         self._lost_frames = 0
         self._timings_ms: dict[str, float] = {}
 
@@ -66,13 +69,30 @@ class DyObSlam:
         with self._stage("view"):
             sigma, offset = self.sensor.noise.sigma_disparity_px, self.sensor.offset.offset_px
             view = complete_view(self.camera, prepared, sigma, offset)
+        objects, frame_objects = self._objects, None
+        T_predicted = self._predicted_pose(view.timestamp_s)
+        with self._stage("objects"):
+            flow = view.flow_prev_to_curr_px
+            frame_objects = objects.associate(view, flow, detections(prepared.frame), T_predicted)
         # 4. Camera pose
         tracked = self._track(view)
+        with self._stage("objects"):
+            estimates = objects.estimate(
+                view, flow, frame_objects, tracked.T_world_camera, tracked.covariance
+            )
         # 10. Sparse map
         with self._stage("mapping"):
             is_keyframe = self._grow_map(view, tracked)
         self._timings_ms["total"] = sum(self._timings_ms.values())
-        return self._result(prepared.frame, tracked, is_keyframe)
+        return replace(
+            self._result(prepared.frame, tracked, is_keyframe),
+            objects=estimates,
+            object_labels=frame_objects.labels,
+        )
+
+    def _predicted_pose(self, timestamp_s):
+        motion = self._tracker.motion
+        return np.eye(4) if motion is None else motion.predict(timestamp_s)
 
     def prepare(self, frame: Frame) -> PreparedFrame:
         """The part of a frame's work that depends on no other frame; it may run ahead of `process`.
@@ -177,6 +197,15 @@ class DyObSlam:
         finally:
             spent = 1e3 * (time.perf_counter() - begin)
             self._timings_ms[name] = self._timings_ms.get(name, 0.0) + spent
+
+
+def detections(frame):
+    labels = frame.instance_labels
+    if labels is None:
+        return Detections.empty(frame.image.shape)
+    ids = np.flatnonzero(np.bincount(labels.ravel()))
+    ids = ids[ids > 0].astype(np.int32)
+    return Detections(labels, ids, np.full(len(ids), "object", "U16"), np.ones(len(ids)))
 
 
 def _check_size(camera: StereoCamera, frame: Frame) -> None:

@@ -47,18 +47,22 @@ def skew(v: Array) -> Array:
 
 
 def exp_se3(xi: Array) -> Array:
-    """Rigid motion (4, 4) of a twist (6,) [omega rad, v m]."""
-    omega, v = xi[:3], xi[3:]
-    theta = float(np.linalg.norm(omega))
+    """Rigid motions (..., 4, 4) of twists (..., 6) [omega rad, v m]."""
+    omega, v = xi[..., :3], xi[..., 3:]
+    theta2 = np.einsum("...i,...i->...", omega, omega)
+    small = theta2 < 1e-16
+    theta2 = np.where(small, 1.0, theta2)
+    theta = np.sqrt(theta2)
+    A = np.where(small, 1.0, np.sin(theta) / theta)[..., None, None]
+    B = np.where(small, 0.5, (1.0 - np.cos(theta)) / theta2)[..., None, None]
+    C = np.where(small, 1.0 / 6.0, (1.0 - np.sin(theta) / theta) / theta2)[..., None, None]
     W = skew(omega)
-    if theta < 1e-8:
-        A, B, C = 1.0, 0.5, 1.0 / 6.0
-    else:
-        A = np.sin(theta) / theta
-        B = (1.0 - np.cos(theta)) / theta**2
-        C = (1.0 - A) / theta**2
     W2 = W @ W
-    return make_T(np.eye(3) + A * W + B * W2, (np.eye(3) + B * W + C * W2) @ v)
+    T = np.zeros((*xi.shape[:-1], 4, 4))
+    T[..., :3, :3] = np.eye(3) + A * W + B * W2
+    T[..., :3, 3] = ((np.eye(3) + B * W + C * W2) @ v[..., None])[..., 0]
+    T[..., 3, 3] = 1.0
+    return T
 
 
 def orthonormalise(T: Array) -> Array:
@@ -82,6 +86,12 @@ def rotation_angle_deg(T: Array) -> Array:
     )
     trace = np.trace(R, axis1=-2, axis2=-1)
     return np.degrees(np.arctan2(np.linalg.norm(w, axis=-1), trace - 1.0))
+
+
+def rotation_vector(T: Array) -> Array:
+    """Rotation vectors (..., 3) in rad of motions (..., 4, 4)."""
+    flat = T[..., :3, :3].reshape(-1, 3, 3)
+    return Rotation.from_matrix(flat).as_rotvec().reshape(*T.shape[:-2], 3)
 
 
 def q_xyzw_from_T(T: Array) -> Array:

@@ -41,7 +41,7 @@ class ConstantVelocity:
         """T_world_camera (4, 4) at a time, if the camera keeps its velocity."""
         if self._step is None or self._step_s <= 0.0:
             return self.T_world_camera
-        return self.T_world_camera @ _scale_motion(
+        return self.T_world_camera @ scale_motion(
             self._step, (timestamp_s - self.timestamp_s) / self._step_s
         )
 
@@ -52,7 +52,7 @@ class ConstantVelocity:
         self.T_world_camera, self.timestamp_s = T_world_camera, timestamp_s
 
 
-def _scale_motion(T: Array, share: float) -> Array:
+def scale_motion(T: Array, share: float) -> Array:
     """A share of the small motion `T` (4, 4): its rotation angle and translation scaled."""
     q = q_xyzw_from_T(T)
     half = np.arctan2(np.linalg.norm(q[:3]), q[3])

@@ -1,6 +1,8 @@
-"""Motion-only bundle adjustment: one camera pose from stereo pixels of known points.
+"""Motion-only bundle adjustment: poses from stereo pixels of known points, of one body or many.
 
-Owns eq. (1) of the paper, its weights and its robust minimisation. Knows no images and no map.
+Owns eqs. (1) and (3) of the paper, their weights and their robust minimisation. Knows no images and
+no map. The still world is one body; each moving object is another, of which the camera has a pose
+as well, so that one solver serves both and all objects are solved at once.
 
 Deviation: the paper weighs all observations alike and sees one pixel (u_L, v) a point. Here each
 weighs by its noise and its point's covariance, and close points are seen by the right camera too.
@@ -53,6 +55,22 @@ class PoseEstimate:
         return int(self.inliers.sum())
 
 
+@dataclass(frozen=True, slots=True)
+class PoseEstimates:
+    """The camera's poses as J bodies see it, each in the axes of its own points.
+
+    Ts_body_camera: (J, 4, 4). covariances: (J, 6, 6) of the right perturbations, NaN where fewer
+    than six points agree. n_inliers: (J,). The rest is as in `PoseEstimate`, all bodies in a row.
+    """
+
+    Ts_body_camera: Array
+    covariances: Array
+    n_inliers: NDArray[np.int64]
+    inliers: NDArray[np.bool_]
+    chi2: Array
+    residuals_px: Array
+
+
 def estimate_camera_pose(
     camera: StereoCamera,
     T_world_camera: Array,
@@ -62,33 +80,64 @@ def estimate_camera_pose(
 ) -> PoseEstimate:
     """Camera pose that minimises the reprojection error, eq. (1), from an initial guess.
 
+    See `estimate_poses`, of which this is the case of one body: the still world.
+    """
+    sizes = np.array([len(observations)])
+    found = estimate_poses(
+        camera, T_world_camera[None], observations, sizes, robust_rounds, gate_px
+    )
+    return PoseEstimate(
+        found.Ts_body_camera[0],
+        found.covariances[0],
+        found.inliers,
+        found.chi2,
+        found.residuals_px,
+    )
+
+
+def estimate_poses(
+    camera: StereoCamera,
+    Ts_body_camera: Array,
+    observations: StereoObservations,
+    sizes: NDArray[np.int64],
+    robust_rounds: int = 2,
+    gate_px: float = np.inf,
+) -> PoseEstimates:
+    """Poses (J, 4, 4) that minimise the reprojection error of each body, eqs. (1) and (3).
+
+    Ts_body_camera: (J, 4, 4) initial guesses. observations: of all bodies in a row, the points of
+    each in its own axes. sizes: (J,) how many belong to each.
     Huber's kernel on Mahalanobis distances, then chi-square rejection (95 %), `robust_rounds` times
     (one will do from a good guess), and a last solution of the inliers alone. The weight of an
     observation is the inverse of its pixel noise plus its point's uncertainty seen in the image,
-    which eliminates the points exactly to first order. Observations more than `gate_px` from the
+    which eliminates the points, and the error of the measured flow, exactly to first order (what
+    VDO-SLAM calls the joint refinement of flow and pose). Observations more than `gate_px` from the
     guess join after the first round: many that move alike would drag even a robust cost along.
     """
-    T = T_world_camera
-    problem = _Problem(camera, T, observations)
-    used = np.abs(problem.residuals(T)[:, :2]).max(axis=1, initial=0.0) <= gate_px
-    if used.sum() < _MIN_POINTS:
-        used[:] = True
+    Ts = Ts_body_camera
+    problem = _Problem(camera, Ts, observations, sizes)
+    used = np.abs(problem.residuals(Ts)[:, :2]).max(axis=1, initial=0.0) <= gate_px
+    for j in np.flatnonzero(problem.count(used) < _MIN_POINTS):
+        used[problem.bodies[j]] = True
     for round_index in range(robust_rounds):
         if round_index > 0:
-            problem = _Problem(camera, T, observations)
-        T = problem.minimise(T, used, robust=True)
-        problem.allow_for_noise(T)
-        used = problem.chi2(T) <= problem.limit
-        if used.sum() < _MIN_POINTS:
+            problem = _Problem(camera, Ts, observations, sizes)
+        Ts = problem.minimise(Ts, used, robust=True)
+        problem.allow_for_noise(Ts)
+        used = problem.chi2(Ts) <= problem.limit
+        if (problem.count(used) < _MIN_POINTS).all():
             break
-    T = problem.minimise(T, used, robust=False)
-    residuals, chi2 = problem.residuals(T), problem.chi2(T)
+    Ts = problem.minimise(Ts, used, robust=False)
+    residuals, chi2 = problem.residuals(Ts), problem.chi2(Ts)
     used = chi2 <= problem.limit
-    covariance = np.full((6, 6), np.nan)
-    if used.sum() >= _MIN_POINTS:
-        covariance = np.linalg.pinv(problem.normal_equations(T, used, False)[0], hermitian=True)
+    n_inliers = problem.count(used)
+    covariances = np.full((len(Ts), 6, 6), np.nan)
+    solved = n_inliers >= _MIN_POINTS
+    if solved.any():
+        information = problem.normal_equations(Ts, used, False)[0]
+        covariances[solved] = np.linalg.pinv(information[solved], hermitian=True)
     residuals[np.isnan(observations.uvr_px)] = np.nan
-    return PoseEstimate(T, covariance, used, chi2, residuals)
+    return PoseEstimates(Ts, covariances, n_inliers, used, chi2, residuals)
 
 
 def observation_covariance(
@@ -99,7 +148,14 @@ def observation_covariance(
     Pixel noise plus the point's covariance seen through the projection.
     """
     points = transform_points(invert_T(T_world_camera), observations.points_world_m)
-    J = projection_jacobian(camera, points) @ T_world_camera[:3, :3].T
+    return _residual_covariance(camera, points, T_world_camera[:3, :3], observations)
+
+
+def _residual_covariance(
+    camera: StereoCamera, points_camera: Array, R: Array, observations: StereoObservations
+) -> Array:
+    """The same from points (N, 3) in the camera and rotations (3, 3) or (N, 3, 3) to it."""
+    J = projection_jacobian(camera, points_camera) @ np.swapaxes(R, -1, -2)
     S = J @ observations.point_covariances_m2 @ J.transpose(0, 2, 1)
     return add_pixel_noise(S, observations)
 
@@ -138,44 +194,64 @@ def whitening(covariances: Array) -> Array:
 
 
 class _Problem:
-    """The least-squares problem of one pose, whitened at a given guess.
+    """The least-squares problems of the poses of J bodies, whitened at given guesses.
 
     Arrays are kept by component (3, N) rather than by point: long contiguous rows are what makes
-    numpy fast here.
+    numpy fast here, and all bodies share them.
     """
 
-    def __init__(self, camera: StereoCamera, T: Array, observations: StereoObservations) -> None:
+    def __init__(
+        self,
+        camera: StereoCamera,
+        Ts: Array,
+        observations: StereoObservations,
+        sizes: NDArray[np.int64],
+    ) -> None:
         self.camera = camera
-        self.points = observations.points_world_m
+        ends = np.cumsum(sizes)
+        self.bodies = [slice(int(end - n), int(end)) for n, end in zip(sizes, ends, strict=True)]
+        self.points = np.ascontiguousarray(observations.points_world_m.T)
         self.mono = np.isnan(observations.uvr_px[:, 2])
         self.uvr = np.nan_to_num(observations.uvr_px).T.copy()
         self.limit = np.where(self.mono, CHI2_95_2DOF, CHI2_95_3DOF)
-        W = whitening(observation_covariance(camera, T, observations))
+        x, y, inverse_z, visible = self._in_camera(Ts)
+        points_camera = np.stack([x, y, 1.0 / inverse_z], -1)
+        R = Ts[0, :3, :3] if len(Ts) == 1 else np.repeat(Ts[:, :3, :3], sizes, axis=0)
+        W = whitening(_residual_covariance(camera, points_camera, R, observations))
         W[self.mono, 2] = 0.0  # the first two rows do not know of the third
-        self.usable = self._in_camera(T)[3] & np.isfinite(W).all(axis=(1, 2))
+        self.usable = visible & np.isfinite(W).all(axis=(1, 2))
         W[~self.usable] = 0.0  # nothing is known of a projection from behind
         self.W = W.transpose(1, 2, 0).copy()
 
-    def allow_for_noise(self, T: Array) -> None:
-        """Widen all weights where this frame is so noisy that half of it would be rejected.
+    def count(self, used: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """(J,) how many observations of each body are used."""
+        return np.array([int(used[body].sum()) for body in self.bodies])
+
+    def allow_for_noise(self, Ts: Array) -> None:
+        """Widen a body's weights where it is so noisy that half of it would be rejected.
 
         The median of chi-square says by how much; it may at most double the standard deviations.
         """
-        if len(self.mono) == 0:
-            return
         expected = np.where(self.mono, _CHI2_MEDIAN_2DOF, _CHI2_MEDIAN_3DOF)
-        excess = float(np.median(self.chi2(T) / expected))
-        if excess > _NOISY:
-            self.W /= min(np.sqrt(excess), _MAX_NOISE_FACTOR)
+        share = self.chi2(Ts) / expected
+        for body in self.bodies:
+            if body.start == body.stop:
+                continue
+            excess = float(np.median(share[body]))
+            if excess > _NOISY:
+                self.W[:, :, body] /= min(np.sqrt(excess), _MAX_NOISE_FACTOR)
 
-    def _in_camera(self, T: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    def _in_camera(self, Ts: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
         """x, y, 1 / z of the points in the camera, each (N,), and which are in front of it."""
-        x, y, z = T[:3, :3].T @ (self.points.T - T[:3, 3:])
+        q = np.empty_like(self.points)
+        for T, body in zip(Ts, self.bodies, strict=True):
+            np.matmul(T[:3, :3].T, self.points[:, body] - T[:3, 3:], out=q[:, body])
+        x, y, z = q
         visible = z > MIN_DEPTH_M
         return x, y, 1.0 / np.where(visible, z, 1.0), visible
 
     def _residual_rows(self, x: Array, y: Array, inverse_z: Array) -> tuple[Array, Array, Array]:
-        """Measured minus predicted u_L, v, u_R, each (N,); eq. (1)."""
+        """Measured minus predicted u_L, v, u_R, each (N,); eqs. (1) and (3)."""
         camera = self.camera
         u = camera.fx * x * inverse_z + camera.cx
         v = camera.fy * y * inverse_z + camera.cy
@@ -186,32 +262,32 @@ class _Problem:
         W = self.W
         return W[0, 0] * a, W[1, 0] * a + W[1, 1] * b, W[2, 0] * a + W[2, 1] * b + W[2, 2] * c
 
-    def residuals(self, T: Array) -> Array:
+    def residuals(self, Ts: Array) -> Array:
         """(N, 3) residuals in px, 0 where unmeasured."""
-        return np.stack(self._residual_rows(*self._in_camera(T)[:3]), -1)
+        return np.stack(self._residual_rows(*self._in_camera(Ts)[:3]), -1)
 
-    def chi2(self, T: Array) -> Array:
+    def chi2(self, Ts: Array) -> Array:
         """(N,) squared Mahalanobis distances, inf behind the camera (now or when whitened)."""
-        x, y, inverse_z, visible = self._in_camera(T)
+        x, y, inverse_z, visible = self._in_camera(Ts)
         e0, e1, e2 = self._whiten(*self._residual_rows(x, y, inverse_z))
         return np.where(visible & self.usable, e0 * e0 + e1 * e1 + e2 * e2, np.inf)
 
-    def cost(self, T: Array, used: NDArray[np.bool_], robust: bool) -> float:
-        """Half the (Huber) cost of the used observations; one behind the camera costs a lot."""
-        chi2, limit = self.chi2(T)[used], self.limit[used]
-        chi2 = np.minimum(chi2, 1e6 * limit)
+    def cost(self, Ts: Array, used: NDArray[np.bool_], robust: bool) -> Array:
+        """(J,) half the (Huber) costs of the used observations; one behind costs a lot."""
+        chi2, limit = np.minimum(self.chi2(Ts), 1e6 * self.limit), self.limit
         if robust:
             chi2 = np.where(chi2 <= limit, chi2, 2.0 * np.sqrt(limit * chi2) - limit)
-        return 0.5 * float(chi2.sum())
+        chi2 *= used
+        return np.array([0.5 * float(chi2[body].sum()) for body in self.bodies])
 
     def normal_equations(
-        self, T: Array, used: NDArray[np.bool_], robust: bool
+        self, Ts: Array, used: NDArray[np.bool_], robust: bool
     ) -> tuple[Array, Array]:
-        """J^T W J (6, 6) and J^T W r (6,) at `T`, for the right perturbation [omega, v]."""
+        """J^T W J (J, 6, 6) and J^T W r (J, 6) at `Ts`, for right perturbations [omega, v]."""
         camera = self.camera
-        x, y, inverse_z, visible = self._in_camera(T)
+        x, y, inverse_z, visible = self._in_camera(Ts)
         z = 1.0 / inverse_z
-        e = self._whiten(*self._residual_rows(x, y, inverse_z))
+        e = np.stack(self._whiten(*self._residual_rows(x, y, inverse_z)))
         weight = (used & visible & self.usable).astype(float)
         if robust:
             chi2 = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
@@ -232,27 +308,38 @@ class _Problem:
             J[1, row] = az * x - ax * z
             J[2, row] = ax * y - ay * x
             J[3, row], J[4, row], J[5, row] = -ax, -ay, -az
-        weighted = (J * weight).reshape(6, -1)
-        return weighted @ J.reshape(6, -1).T, weighted @ np.concatenate(e)
+        weighted = J * weight
+        H, g = np.empty((len(Ts), 6, 6)), np.empty((len(Ts), 6))
+        for j, body in enumerate(self.bodies):
+            w = weighted[:, :, body].reshape(6, -1)
+            H[j] = w @ J[:, :, body].reshape(6, -1).T
+            g[j] = w @ e[:, body].ravel()
+        return H, g
 
-    def minimise(self, T: Array, used: NDArray[np.bool_], robust: bool) -> Array:
-        """Levenberg-Marquardt (paper) from `T` (4, 4) with a fixed set of observations."""
-        damping = 1e-6
-        cost = self.cost(T, used, robust)
-        H, g = self.normal_equations(T, used, robust)
+    def minimise(self, Ts: Array, used: NDArray[np.bool_], robust: bool) -> Array:
+        """Levenberg-Marquardt (paper) from `Ts` (J, 4, 4) with a fixed set of observations.
+
+        Each body has its own damping, and stops on its own.
+        """
+        damping = np.full(len(Ts), 1e-6)
+        going = np.ones(len(Ts), bool)
+        cost = self.cost(Ts, used, robust)
+        H, g = self.normal_equations(Ts, used, robust)
         for _ in range(_MAX_ITERATIONS):
-            step = np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-9), g)
-            if not np.isfinite(step).all():
+            diagonal = damping[:, None] * np.diagonal(H, axis1=1, axis2=2) + 1e-9
+            step = np.linalg.solve(H + diagonal[:, :, None] * np.eye(6), g[..., None])[..., 0]
+            going &= np.isfinite(step).all(axis=1)
+            step[~going] = 0.0
+            Ts_new = Ts @ exp_se3(step)
+            cost_new = self.cost(Ts_new, used, robust)
+            better = going & (cost_new <= cost)
+            Ts = np.where(better[:, None, None], Ts_new, Ts)
+            cost = np.where(better, cost_new, cost)
+            damping = np.where(better, np.maximum(damping * 0.1, 1e-9), damping * 100.0)
+            length2 = np.einsum("ji,jik,jk->j", step, H, step)
+            going &= ~(better & (length2 < _CONVERGED_SIGMAS**2)) & (damping <= 1e6)
+            if not going.any():
                 break
-            T_new = T @ exp_se3(step)
-            cost_new = self.cost(T_new, used, robust)
-            if cost_new <= cost:
-                T, cost, damping = T_new, cost_new, max(damping * 0.1, 1e-9)
-                if step @ H @ step < _CONVERGED_SIGMAS**2:
-                    break
-                H, g = self.normal_equations(T, used, robust)
-            else:
-                damping *= 100.0
-                if damping > 1e6:
-                    break
-        return T
+            if better.any():
+                H, g = self.normal_equations(Ts, used, robust)
+        return Ts

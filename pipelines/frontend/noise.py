@@ -31,7 +31,13 @@ class NoiseModel:
     """
 
     sigma_uv_px: dict[str, float] = field(
-        default_factory=lambda: {"flow": 0.3, "alignment": 0.3, "orb": 0.9}
+        default_factory=lambda: {
+            "flow": 0.3,
+            "alignment": 0.3,
+            "orb": 0.9,
+            "object_flow": 0.3,
+            "object_alignment": 0.3,
+        }
     )
     sigma_disparity_px: float = 0.5
     memory: float = 0.8
@@ -56,6 +62,11 @@ class NoiseModel:
     def learn_uv(self, source: str, residuals_px: Array) -> None:
         """Take in the pixel residuals (N, 2) of one frame's inliers."""
         self.sigma_uv_px[source] = self._blend(source, self.sigma_uv_px[source], residuals_px)
+
+    def borrow(self, source: str, other: str) -> None:
+        """Begin a source that taught nothing yet with the noise of another that did."""
+        if source not in self._seen and other in self._seen:
+            self.sigma_uv_px[source] = self.sigma_uv_px[other]
 
     def learn_disparity(self, residuals_px: Array) -> None:
         """Take in the disparity residuals (N,) of one frame's inliers."""

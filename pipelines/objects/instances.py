@@ -1,0 +1,134 @@
+"""What can be measured of the instances of a label image: place, size, colour; and carrying them.
+
+Owns the reading of masks. Knows no tracks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import find_objects
+
+from pipelines.geometry import backproject
+from pipelines.object_types import Detections
+from pipelines.objects.points import Window
+from pipelines.types import Array, Image, StereoCamera
+
+_SAMPLES = 400  # pixels of an instance that its depth and colour are read from
+_BINS = 4  # of the colour histogram, per channel
+_CARRY_INLIER_PX = 3.0  # of points that move as the mask is moved
+_MIN_CARRY_SHARE = 0.5  # of the points must
+
+
+@dataclass(frozen=True, slots=True)
+class Instances:
+    """M instances of one image.
+
+    labels: (H, W) int32, 0 = background, n = row n - 1. windows: where each lies, None where it has
+    no pixel. n_pixels: (M,). boxes_px: (M, 4) first and last columns and rows, NaN without pixels.
+    centers_m: (M, 3) in the camera, at the median depth; NaN where no depth is known.
+    colors: (M, 64) histograms that sum to 1. class_names: (M,). scores: (M,).
+    """
+
+    labels: NDArray[np.int32]
+    windows: list[Window | None]
+    n_pixels: NDArray[np.int64]
+    boxes_px: Array
+    centers_m: Array
+    colors: Array
+    class_names: NDArray[np.str_]
+    scores: Array
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+
+def describe_instances(
+    camera: StereoCamera,
+    image: Image,
+    disparity_px: NDArray[np.float32],
+    detections: Detections,
+) -> Instances:
+    """Read off place, size and colour of each detection. image: (H, W[, 3]). disparity: (H, W)."""
+    M = len(detections)
+    highest = int(detections.label_ids.max(initial=0))
+    table = np.zeros(highest + 1, np.int32)
+    table[detections.label_ids] = np.arange(1, M + 1)
+    labels = table[np.clip(detections.labels, 0, highest)] if M else detections.labels
+    windows = find_objects(labels, max_label=M) if M else []
+    n_pixels = np.zeros(M, np.int64)
+    boxes = np.full((M, 4), np.nan)
+    centers = np.full((M, 3), np.nan)
+    colors = np.zeros((M, _BINS**3))
+    for m, window in enumerate(windows):
+        if window is None:
+            continue
+        v, u = np.nonzero(labels[window] == m + 1)
+        n_pixels[m] = len(v)
+        rows, columns = window
+        boxes[m] = columns.start, rows.start, columns.stop - 1, rows.stop - 1
+        step = max(1, len(v) // _SAMPLES)
+        v, u = v[::step] + rows.start, u[::step] + columns.start
+        colors[m] = _color_histogram(image[v, u])
+        disparity = disparity_px[v, u]
+        known = disparity > 0
+        if known.any():
+            middle = np.median(disparity[known])
+            uv = np.array([[np.median(u), np.median(v)]])
+            centers[m] = backproject(camera, uv, np.array([camera.bf / middle]))[0]
+    return Instances(
+        labels, windows, n_pixels, boxes, centers, colors, detections.class_names, detections.scores
+    )
+
+
+def _color_histogram(pixels: NDArray[np.uint8]) -> Array:
+    """(64,) of RGB (N, 3) or grey (N,) pixels, normalised by their mean brightness."""
+    values = pixels.astype(np.float32).reshape(len(pixels), -1)
+    values = values * (110.0 / max(float(values.mean()), 1.0))  # exposure changes
+    binned = np.clip(values * (_BINS / 256.0), 0, _BINS - 1).astype(np.int64)
+    if binned.shape[1] == 1:
+        binned = np.repeat(binned, 3, axis=1)
+    index = (binned[:, 0] * _BINS + binned[:, 1]) * _BINS + binned[:, 2]
+    return np.bincount(index, minlength=_BINS**3) / len(pixels)
+
+
+def carry_mask(
+    mask: NDArray[np.bool_],
+    window: Window,
+    uv_prev_px: Array,
+    uv_px: Array,
+    shape: tuple[int, ...],
+) -> tuple[NDArray[np.bool_], Window] | None:
+    """A mask of the previous frame, moved as the object's points moved.
+
+    mask: (h, w) inside `window` of the previous image. uv_prev_px, uv_px: (N, 2) its points then
+    and now. shape: (H, W) of the image. Returns the mask and its window in the present image, or
+    None where the points do not move together or nothing stays in view.
+    Paper, section Dense Optical Flow: where segmentation fails, the flow of an object's points
+    brings its mask back. Deviation: the pixels follow the points' common shift, turn and scale, as
+    dense flow tears at the borders of a mask.
+    """
+    A, agree = cv2.estimateAffinePartial2D(
+        uv_prev_px, uv_px, method=cv2.RANSAC, ransacReprojThreshold=_CARRY_INLIER_PX
+    )
+    if A is None or agree.mean() < _MIN_CARRY_SHARE:
+        return None
+    rows, columns = window
+    corners = np.array(
+        [(u, v) for u in (columns.start, columns.stop - 1) for v in (rows.start, rows.stop - 1)]
+    )
+    moved = corners @ A[:, :2].T + A[:, 2]
+    low = np.maximum(np.floor(moved.min(0)), 0).astype(int)
+    high = np.minimum(np.ceil(moved.max(0)) + 1, (shape[1], shape[0])).astype(int)
+    if (high <= low).any():
+        return None
+    A = A.copy()
+    A[:, 2] += A[:, :2] @ (columns.start, rows.start) - low
+    size = (int(high[0] - low[0]), int(high[1] - low[1]))
+    carried = cv2.warpAffine(mask.astype(np.uint8), A, size, flags=cv2.INTER_NEAREST) > 0
+    if not carried.any():
+        return None
+    return carried, (slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0])))

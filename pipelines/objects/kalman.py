@@ -1,0 +1,117 @@
+"""The Kalman filter of one object: where its centre is in the world, and how it moves.
+
+Owns the motion model: constant velocity that turns as the object was last seen to turn. Used for
+gates, coasting and the smoothed speed; measures nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pipelines.types import Array
+
+_MAX_TURN_RADPS = 1.0  # faster turns are noise of small objects, and would curl their prediction
+_GATE = 16.8  # chi-square, 6 degrees of freedom, 99 %
+_TURN_MEMORY = 0.7  # share of the old turn rate that each measurement keeps
+
+
+class ObjectFilter:
+    """State (6,): centre in m and velocity in m/s, in the world; step 9 of the design.
+
+    center_m: (3,) first seen, with covariance (3, 3). acceleration_mps2: standard deviation of the
+    unmodelled acceleration. A new object may move at any speed up to `_FIRST_SPEED_MPS`.
+    """
+
+    _FIRST_SPEED_MPS = 15.0
+
+    def __init__(self, center_m: Array, covariance_m2: Array, acceleration_mps2: float) -> None:
+        from filterpy.kalman import KalmanFilter  # takes two seconds
+
+        self._kf: Any = KalmanFilter(dim_x=6, dim_z=6)
+        self._kf.x = np.r_[center_m, np.zeros(3)]
+        self._kf.P = np.zeros((6, 6))
+        self._kf.P[:3, :3] = covariance_m2
+        self._kf.P[3:, 3:] = self._FIRST_SPEED_MPS**2 * np.eye(3)
+        self._acceleration = acceleration_mps2
+        self.turn_radps = np.zeros(3)
+
+    @property
+    def center_m(self) -> Array:
+        """(3,) in the world."""
+        return self._kf.x[:3].copy()
+
+    @property
+    def velocity_mps(self) -> Array:
+        """(3,) in the world."""
+        return self._kf.x[3:].copy()
+
+    @property
+    def center_covariance_m2(self) -> Array:
+        """(3, 3)."""
+        return self._kf.P[:3, :3].copy()
+
+    @property
+    def velocity_covariance(self) -> Array:
+        """(3, 3), (m/s)^2."""
+        return self._kf.P[3:, 3:].copy()
+
+    @property
+    def speed_std_mps(self) -> float:
+        """Standard deviation of the speed: that of the velocity along its own direction."""
+        return direction_std(self.velocity_mps, self.velocity_covariance)
+
+    def predict(self, dt_s: float) -> None:
+        """Move on by a time; the velocity turns at the rate last seen."""
+        R = Rotation.from_rotvec(self.turn_radps * dt_s).as_matrix()
+        half = Rotation.from_rotvec(self.turn_radps * (0.5 * dt_s)).as_matrix()
+        F = np.eye(6)
+        F[:3, 3:] = dt_s * half  # the chord of the arc
+        F[3:, 3:] = R
+        # White acceleration, constant over the step
+        G = np.vstack([0.5 * dt_s**2 * np.eye(3), dt_s * np.eye(3)])
+        self._kf.predict(F=F, Q=self._acceleration**2 * G @ G.T)
+
+    def update_motion(
+        self,
+        center_m: Array,
+        center_covariance_m2: Array,
+        velocity_mps: Array,
+        velocity_covariance: Array,
+        turn_radps: Array,
+    ) -> None:
+        """Take in a measured motion: centre (3,) now, mean velocity (3,) over the last step.
+
+        turn_radps: (3,) rotation vector per second, in the world. A measurement outside its 99 %
+        gate counts as less certain, just so much that it lies on the gate: one wild motion does
+        not carry the filter away, and several that agree do.
+        """
+        R = np.zeros((6, 6))
+        R[:3, :3], R[3:, 3:] = center_covariance_m2, velocity_covariance
+        z = np.r_[center_m, velocity_mps]
+        innovation = z - self._kf.x
+        distance2 = float(innovation @ np.linalg.solve(self._kf.P + R, innovation))
+        self._kf.update(z, R=R * max(1.0, distance2 / _GATE), H=np.eye(6))
+        turn = _TURN_MEMORY * self.turn_radps + (1.0 - _TURN_MEMORY) * turn_radps
+        self.turn_radps = turn * min(1.0, _MAX_TURN_RADPS / max(float(np.linalg.norm(turn)), 1e-9))
+
+    def update_center(self, center_m: Array, covariance_m2: Array) -> None:
+        """Take in a centre (3,) alone, where no motion could be measured."""
+        H = np.hstack([np.eye(3), np.zeros((3, 3))])
+        self._kf.update(center_m, R=covariance_m2, H=H)
+
+    def distance2(self, center_m: Array, covariance_m2: Array) -> float:
+        """Squared Mahalanobis distance of a centre (3,) seen with a covariance (3, 3)."""
+        d = center_m - self._kf.x[:3]
+        return float(d @ np.linalg.solve(self._kf.P[:3, :3] + covariance_m2, d))
+
+
+def direction_std(vector: Array, covariance: Array) -> float:
+    """Standard deviation of the length of a vector (3,): along it, or the largest where it is 0."""
+    length = float(np.linalg.norm(vector))
+    if length < 1e-9:
+        return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    unit = vector / length
+    return float(np.sqrt(max(unit @ covariance @ unit, 0.0)))
