@@ -35,7 +35,7 @@ _EGO_S = 31.0
 _NEAR_LANE, _FAR_LANE = CROSSING_S - 1.75, CROSSING_S + 1.75  # of the side street, along s
 Speeds = tuple[tuple[float, float], ...]
 _BACKING: Speeds = (
-    (0.0, 6.5), (2.4, 6.5), (5.2, 0.0), (6.2, -3.2), (8.4, -3.2), (9.8, 0.0)
+    (0.0, 6.5), (2.4, 6.5), (5.2, 0.0), (6.6, -3.2), (8.4, -3.2), (9.8, 0.0)
 )  # fmt: skip
 
 
@@ -58,9 +58,9 @@ VAN, RETURNING_CAR, LEADING_CAR, WAITING_CAR, CROSSING_WALKER, PAVEMENT_WALKER =
 EVENTS: tuple[Event, ...] = (
     Event("stop", WAITING_CAR, None, (22, 42)),  # at the stop line, facing the camera
     Event("hidden", WAITING_CAR, VAN, (28, 35)),  # while it stands
-    Event("hidden", CROSSING_WALKER, VAN, (37, 43)),  # walking the other way
+    Event("hidden", CROSSING_WALKER, VAN, (28, 35)),  # walking the other way
     Event("hidden", LEADING_CAR, VAN, (39, 47)),  # driving away
-    Event("away", RETURNING_CAR, None, (44, 63)),  # leaves on the left, backs up into view
+    Event("away", RETURNING_CAR, None, (44, 66)),  # leaves on the left, backs up into view
     Event("hidden", PAVEMENT_WALKER, VAN, (48, 55)),
     Event("away", VAN, None, (72, 99)),  # leaves on the right for good
     Event("away", WAITING_CAR, None, (93, 99)),  # passes the camera for good
@@ -142,7 +142,10 @@ def _traffic(script: StreetScript) -> None:
 def _walkers(script: StreetScript) -> None:
     """One person crosses the main road beyond the junction, two walk along the pavement."""
     t = script.times
-    across = _across(script, CROSSING_S + 5.9, 3.7 - 1.35 * t, -1)
+    lateral = -1.5 - 1.35 * t
+    across = _across(script, CROSSING_S + 5.9, lateral, -1)
+    step = np.clip((-10.3 - lateral) / 0.4, 0, 1)  # up the kerb
+    across[:, 1, 3] = -KERB_M * step**2 * (3 - 2 * step)
     script.walker(across)
     for s, direction in ((60.0, 1), (34.0, 1)):
         along = s + direction * 1.2 * t

@@ -20,7 +20,7 @@ from pipelines.datasets.simulated.meshes import pose
 from pipelines.types import Array
 
 FPS = 10.0
-_SMOOTHING = 0.3  # passes motion slower than about 0.4 Hz: braking, but not the labels' jitter
+_SMOOTHING = 0.05  # passes what is slower than half a hertz: braking, not the labels' jitter
 _EGO_SMOOTHING = 0.01
 _SLOW_FRAMES = 21  # what lasts longer than this in pitch, roll and height is the road's slope
 _SHORTEST, _LONGEST_GAP = 3, 5  # frames
@@ -121,7 +121,7 @@ def read_tracks(labels: KittiLabels, n: int) -> list[Track]:
     for number in np.unique(labels.track):
         rows = np.flatnonzero(labels.track == number)
         rows = rows[np.argsort(labels.frame[rows], kind="stable")]
-        if len(rows) >= _SHORTEST:
+        if len(rows) >= _SHORTEST and labels.frame[rows[0]] <= n:
             track = _smooth_track(labels, rows, n)
             if track.labelled.any():
                 tracks.append(track)
@@ -153,7 +153,7 @@ def _smooth_track(labels: KittiLabels, rows: NDArray[np.int64], n: int) -> Track
     yaw = np.arctan2(Ts[:, 0, 2], Ts[:, 2, 2])
     heading = np.unwrap(labels.heading_rad[rows] + yaw)
     # Labels are as noisy as the laser points are few: noise grows with distance.
-    weights = 1.0 / (1.0 + labels.bottom_m[rows, 2] / 20) ** 2
+    weights = 1.0 / (1.0 + labels.bottom_m[rows, 2] / 20)
     size = np.median(labels.size_m[rows], axis=0)
     t, wanted = frames / FPS, np.arange(n + 1) / FPS
     labelled = np.zeros(n + 1, bool)
@@ -177,9 +177,7 @@ def _smooth_track(labels: KittiLabels, rows: NDArray[np.int64], n: int) -> Track
             always > 0,
             False,
         )
-    fine = np.arange(int(min(frames[0], 0)) * 10, (max(n, int(frames[-1])) + 1) * 10 + 1) / (
-        10 * FPS
-    )
+    fine = np.arange(10 * n + 1) / (10 * FPS)
     path = _path(t, xz, weights, person, fine)
     arm = 0.25 if person else 0.3 * float(size[2])
     headings = _trailing(path, fine, arm, (t, heading))

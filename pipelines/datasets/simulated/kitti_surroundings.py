@@ -176,7 +176,7 @@ class Surroundings:
         trees = [tree(self._rng, float(self._rng.uniform(6.0, 8.5))) for _ in range(4)]
         low = np.array([self._ground.x_m[0], self._ground.z_m[0]]) + 14
         high = np.array([self._ground.x_m[-1], self._ground.z_m[-1]]) - 14
-        n = int(np.clip(np.prod(high - low) / 220, 20, 160))
+        n = int(np.clip(np.prod(high - low) / 350, 20, 80))
         spots = self._rng.uniform(low, high, (n, 2))
         turns, kinds = self._rng.uniform(0, 6.3, n), self._rng.integers(0, 4, n)
         outside = self._ground.at(spots)

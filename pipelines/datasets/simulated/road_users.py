@@ -153,7 +153,8 @@ def _lorry_side(rng: np.random.Generator) -> Texture:
     canvas.rect(0, 0, 8, 0.15, (150, 152, 156))
     canvas.polygon([(0.6, 2.5), (2.2, 2.5), (4.4, 0.2), (2.8, 0.2)], (236, 234, 226))
     canvas.polygon([(2.5, 2.5), (2.9, 2.5), (5.1, 0.2), (4.7, 0.2)], (206, 160, 62))
-    canvas.text("NORDEXPRESS", (5.2, 1.3), 0.55, (250, 248, 240))
+    canvas.rect(3.0, 0.9, 7.4, 1.7, (236, 234, 226))
+    canvas.text("NORDEXPRESS", (5.2, 1.3), 0.5, (30, 36, 52))
     canvas.text("0800 " + str(rng.integers(1000, 9999)), (6.3, 2.15), 0.25, (40, 42, 46))
     for x in np.arange(0.0, 8.01, 0.8):
         canvas.line([(x, 0.1), (x, 2.6)], (96, 98, 102, 90), 0.03)
