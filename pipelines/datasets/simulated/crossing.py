@@ -135,7 +135,7 @@ def _traffic(script: StreetScript) -> None:
     script.car(_across(script, _FAR_LANE, backing, -1), True, "hatchback")
     leading = _EGO_S + 33.0 + driven(t, ((0.0, 4.0), (6.0, 7.0)))
     script.car(script.follow(leading, lambda s: 0.0 * s), True, "estate")
-    waiting = _EGO_S + 38.0 - driven(t, ((0.0, 6.0), (2.2, 0.0), (4.2, 0.0), (7.2, 6.0)))
+    waiting = _EGO_S + 37.78 - driven(t, ((0.0, 5.8), (2.2, 0.0), (4.2, 0.0), (7.2, 6.0)))
     script.car(script.follow(waiting, lambda s: constant(s, ONCOMING), -1), True, "saloon")
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from pipelines.datasets.simulated import SimulatedSequence
 
-SMALL = {"street": 0.3, "room": 0.35}
+SMALL = {"street": 0.3, "crossing": 0.3, "room": 0.35}
 
 
 @pytest.fixture(scope="session")
@@ -13,7 +13,7 @@ def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("simulated")
 
 
-@pytest.fixture(scope="session", params=["street", "room"])
+@pytest.fixture(scope="session", params=list(SMALL))
 def exact(request, cache):
     """Four exact frames with everything provided."""
     return SimulatedSequence(
