@@ -13,7 +13,7 @@ def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("simulated")
 
 
-@pytest.fixture(scope="session", params=list(SMALL))
+@pytest.fixture(scope="session", params=["street", "room"])
 def exact(request, cache):
     """Four exact frames with everything provided."""
     return SimulatedSequence(
@@ -28,6 +28,12 @@ def exact(request, cache):
 @pytest.fixture(scope="session")
 def street(cache):
     return SimulatedSequence("street", frames=4, scale=SMALL["street"], cache=cache)
+
+
+@pytest.fixture(scope="session")
+def crossing(cache):
+    """Three exact frames; the camera stands still in them."""
+    return SimulatedSequence("crossing", frames=3, scale=SMALL["crossing"], cache=cache)
 
 
 @pytest.fixture(scope="session")

@@ -43,6 +43,12 @@ def test_flow_is_depth_moved_by_the_true_motion(exact):
     check_flow(exact, 1)
 
 
+def test_flow_before_a_standing_camera_is_the_motion_of_objects(crossing):
+    check_flow(crossing, 1)
+    flow, still = crossing.read(2).flow_prev_to_curr_px, crossing.read(1).instance_labels == 0
+    assert np.abs(flow[still & np.isfinite(flow[..., 0])]).max() < 1e-4
+
+
 def test_flow_of_replayed_traffic_is_its_motion(replayed):
     check_flow(replayed, 8)
 
