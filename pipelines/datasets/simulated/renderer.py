@@ -95,6 +95,8 @@ class Renderer:
         placed = [PlacedBody.of(self._static, 0, T_scene_camera, camera.K, np.eye(3), whole)]
         actors = zip(self.world.actors, self._bodies, strict=True)
         for owner, (actor, body) in enumerate(actors, start=1):
+            if not actor.is_present(index):
+                continue
             T = actor.Ts_scene_object[index]
             corners = box_corners(body.low, body.high)
             window = box_window(camera, corners, T_scene_camera, T, self.world.reach_m)

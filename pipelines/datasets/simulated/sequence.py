@@ -51,7 +51,10 @@ class SimulatedSequence(Sequence):
     dataset = "simulated"
     layout = (
         "no folder: a scene that the project renders itself, written simulated:NAME with NAME one "
-        "of street, room, static or demo, and kept under .cache/simulated or $DYOB_CACHE/simulated"
+        "of street, crossing, room, static, demo or kitti_0000 to kitti_0020, and kept under "
+        ".cache/simulated or $DYOB_CACHE/simulated; kitti_NNNN replays the ego path and traffic of "
+        "KITTI tracking from your own label_02/NNNN.txt, calib/NNNN.txt and "
+        "orbslam3_poses/NNNN/CameraTrajectory.txt in the folder that $DYOB_KITTI_TRACKING names"
     )
 
     def __init__(
@@ -64,17 +67,19 @@ class SimulatedSequence(Sequence):
         provide: str | Iterable[str] = ("depth", "flow", "masks"),
         scale: float = 1.0,
         cache: Path | str | None = None,
+        labels: Path | str | None = None,
         progress: Progress | None = None,
     ) -> None:
         """Open, and at first render, a scene.
 
         spec: name of the scene, with or without `simulated:`. frames, scale: length, and size as
         a share of the scene's own. degrade: see `Degradation.of`. provide: which of depth, flow,
-        masks and right the frames bring. progress: called with (done, total) frames of each stage
-        that is rendered: left, right, degraded.
-        Raises DatasetError for an unknown scene, ConfigError for a bad option.
+        masks and right the frames bring. labels: for kitti_NNNN, the folder of KITTI tracking's
+        labels; $DYOB_KITTI_TRACKING where None. progress: called with (done, total) frames of each
+        stage that is rendered: left, right, degraded.
+        Raises DatasetError for an unknown scene or missing labels, ConfigError for a bad option.
         """
-        self._scene: Scene = find_scene(_scene_name(spec))
+        self._scene: Scene = find_scene(_scene_name(spec), labels)
         self._frames = self._scene.frames if frames is None else int(frames)
         self._seed, self._progress = int(seed), progress
         self._provide = _inputs(provide)
@@ -82,6 +87,11 @@ class SimulatedSequence(Sequence):
             raise ConfigError(
                 "a simulated sequence needs frames >= 1, seed >= 0 and 0.05 <= scale <= 4, "
                 f"found frames={frames}, seed={seed}, scale={scale}"
+            )
+        if self._scene.most_frames is not None and self._frames > self._scene.most_frames:
+            raise ConfigError(
+                f"{self._scene.name} has {self._scene.most_frames} frames, found "
+                f"frames={self._frames}: ask for fewer"
             )
         self.camera = scaled_camera(self._scene.camera, scale)
         self.timestamps_s = np.arange(self._frames) / self._scene.fps
@@ -94,6 +104,8 @@ class SimulatedSequence(Sequence):
             "seed": self._seed,
             "camera": asdict(self.camera),
         }
+        if self._scene.made_of:
+            self._key["made_of"] = self._scene.made_of
         base = cache_root() if cache is None else Path(cache)
         self._exact = self._folder(base, "exact", {}, self._render_left)
         self.root = self._exact
@@ -136,6 +148,7 @@ class SimulatedSequence(Sequence):
                 flow = worn["flow"].astype(np.float32) * np.float32(_FLOW_STEP_PX)
             else:
                 flow = self._exact_flow(index - 1)
+        labels = found["labels"].astype(np.int32) if "masks" in self._provide else None
         return Frame(
             index,
             float(self.timestamps_s[index]),
@@ -143,24 +156,28 @@ class SimulatedSequence(Sequence):
             right,
             found["depth"] if "depth" in self._provide else None,
             flow,
-            found["labels"].astype(np.int32) if "masks" in self._provide else None,
+            labels,
+            None if labels is None else self._classes(labels),
         )
 
     def ground_truth(self) -> GroundTruth:
         """Exact camera and object poses; the world is the first camera.
 
-        Boxes are the first and last pixel columns and rows that an object is seen in.
+        Boxes are the first and last pixel columns and rows that an object is seen in. Objects have
+        rows for the frames in which they are there, seen or not.
         """
         truth = self._truth
-        N, ids = self._frames, truth["object_id"]
-        A = len(ids)
+        N, A = self._frames, len(truth["object_id"])
+        # Only what may be absent has `present`: most scenes' objects are always there.
+        present = truth.get("present", np.ones((N, A), bool))[:N]
+        frame, row = np.nonzero(present)
         objects = ObjectTruth(
-            np.repeat(np.arange(N), A),
-            np.tile(ids, N),
-            np.tile(truth["class_name"], N),
-            truth["Ts_world_object"][:N].reshape(-1, 4, 4),
-            truth["boxes_px"].reshape(-1, 4),
-            np.tile(truth["moving"], N),
+            frame,
+            truth["object_id"][row],
+            truth["class_name"][row],
+            truth["Ts_world_object"][frame, row],
+            truth["boxes_px"][frame, row],
+            truth["moving"][row],
         )
         return GroundTruth(self.timestamps_s.copy(), truth["Ts_world_camera"][:N], objects)
 
@@ -182,6 +199,16 @@ class SimulatedSequence(Sequence):
     def _truth(self) -> dict[str, NDArray]:
         return read_arrays(self._exact / "truth.npz")
 
+    @cached_property
+    def _class_names(self) -> dict[int, str]:
+        truth = self._truth
+        return dict(zip(truth["object_id"].tolist(), truth["class_name"].tolist(), strict=True))
+
+    def _classes(self, labels: NDArray[np.int32]) -> dict[int, str]:
+        """Class names of the labels in a frame, which a detector would know as well."""
+        seen = np.flatnonzero(np.bincount(labels.ravel()))
+        return {label: self._class_names[label] for label in seen.tolist() if label}
+
     def _tell(self, index: int) -> None:
         if self._progress is not None:
             self._progress(index + 1, self._frames)
@@ -192,13 +219,22 @@ class SimulatedSequence(Sequence):
             boxes.append(self._write_left(folder, index))
             self._tell(index)
         world = self._renderer.world
+        presence = {}
+        if any(a.present is not None for a in world.actors):
+            frames = range(self._frames)
+            presence["present"] = np.array(
+                [[a.is_present(k) for a in world.actors] for k in frames], bool
+            )
         write_arrays(
             folder / "truth.npz",
+            **presence,
             object_id=np.array([a.object_id for a in world.actors], np.int64),
             class_name=np.array([a.class_name for a in world.actors], str),
             moving=np.array([a.moving for a in world.actors], bool),
             Ts_world_camera=world.Ts_world_camera(),
-            Ts_world_object=np.stack([world.Ts_world_object(a) for a in world.actors], 1),
+            Ts_world_object=_stacked(
+                [world.Ts_world_object(a) for a in world.actors], self._frames
+            ),
             boxes_px=np.stack(boxes),
         )
 
@@ -325,6 +361,11 @@ def _inputs(provide: str | Iterable[str]) -> frozenset[str]:
     if unknown:
         raise ConfigError(f"unknown input '{unknown[0]}': use some of {', '.join(INPUTS)}")
     return names
+
+
+def _stacked(paths: list[Array], frames: int) -> Array:
+    """Poses (N + 1, A, 4, 4) of A paths (N + 1, 4, 4), of which there may be none."""
+    return np.stack(paths, 1) if paths else np.empty((frames + 1, 0, 4, 4))
 
 
 def _boxes_px(labels: NDArray[np.int32], ids: list[int]) -> Array:

@@ -179,6 +179,8 @@ class Shading:
         position = np.full(len(samples.u), -1, np.int64)
         position[still] = np.arange(len(still))
         for actor, body in zip(self._world.actors, self._bodies, strict=True):
+            if not actor.is_present(index):
+                continue
             T = actor.Ts_scene_object[index]
             window, size = self._patch_window(actor, body, T_scene_camera, index)
             if window is None:

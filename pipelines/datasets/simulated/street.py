@@ -32,18 +32,19 @@ from pipelines.datasets.simulated.world import Actor, Light, World
 from pipelines.types import Array, StereoCamera
 
 FPS = 10.0
-_CROSSING_S, _ZEBRA_S = 52.0, 43.5
-_LEFT_LANE, _ONCOMING = -3.2, -6.6
+CROSSING_S, ZEBRA_S = 52.0, 43.5
+LEFT_LANE, ONCOMING = -3.2, -6.6
 _KERBS = (-10.6, 4.2)
 _FRONTS = (-13.9, 7.4)  # where the houses begin
 _PARKED = (-9.45, 3.05)
-_KERB_M = 0.07
-_EYE_M = 1.65
-_AHEAD_M = 175.0
-_PAINTS = (
+KERB_M = 0.07
+EYE_M = 1.65
+AHEAD_M = 175.0
+CAR_PAINTS = (
     (176, 34, 40), (38, 74, 138), (222, 222, 220), (52, 54, 58), (150, 156, 162),
     (56, 98, 78), (206, 160, 62), (120, 152, 178), (112, 44, 52), (232, 226, 206),
 )  # fmt: skip
+DAYLIGHT = Light((-0.62, -1.0, -0.55), (0.78, 0.73, 0.63), (0.75, 0.78, 0.84), (0.5, 0.48, 0.45))
 
 Along = Callable[[Array], Array]
 
@@ -55,9 +56,9 @@ def make_street(
     rng = np.random.default_rng(seed)
     times = np.arange(frames + 1) / fps
     ego = _ego_s(times)
-    road = Road(float(ego[-1]) + _AHEAD_M)
+    road = Road(float(ego[-1]) + AHEAD_M)
     blocks = range(int(ego[-1] // BLOCK_M) + 2)
-    script = _Script(road, times, rng)
+    script = StreetScript(road, times, rng)
     script.park(blocks)
     if not still:
         script.lead()
@@ -67,10 +68,10 @@ def make_street(
     return World(
         camera,
         fps,
-        _static(road, rng),
+        street_static(road, rng),
         tuple(script.actors),
         _camera_path(road, times),
-        Light((-0.62, -1.0, -0.55), (0.78, 0.73, 0.63), (0.75, 0.78, 0.84), (0.5, 0.48, 0.45)),
+        DAYLIGHT,
         SURFACES | FACADES | VEHICLE_ART,
         sky="sky",
     )
@@ -92,7 +93,7 @@ def _camera_path(road: Road, t: Array) -> Array:
     pitch = 0.004 * np.sin(5.3 * t) + 0.0025 * np.sin(11.0 * t + 1)
     roll = 0.004 * np.sin(3.1 * t + 0.5)
     lift = 0.015 * np.sin(6.1 * t) + 0.006 * np.sin(13.0 * t)
-    Ts = np.stack([pose(a, -_EYE_M + b, c, d) for a, b, c, d in zip(x, lift, z, psi, strict=True)])
+    Ts = np.stack([pose(a, -EYE_M + b, c, d) for a, b, c, d in zip(x, lift, z, psi, strict=True)])
     for T, p, r in zip(Ts, pitch, roll, strict=True):
         tilt = np.array([[1, 0, 0], [0, np.cos(p), -np.sin(p)], [0, np.sin(p), np.cos(p)]])
         lean = np.array([[np.cos(r), -np.sin(r), 0], [np.sin(r), np.cos(r), 0], [0, 0, 1]])
@@ -100,7 +101,7 @@ def _camera_path(road: Road, t: Array) -> Array:
     return Ts
 
 
-class _Script:
+class StreetScript:
     """Collects the actors of the street, with their poses at all times."""
 
     def __init__(self, road: Road, times: Array, rng: np.random.Generator) -> None:
@@ -109,21 +110,23 @@ class _Script:
         self._shapes = {kind: car_mesh(kind) for kind in SHAPES}
         self._walkers = [walker_mesh(clothes) for clothes in WARDROBE]
 
-    def _car(self, Ts: Array, moving: bool, kind: str = "") -> None:
+    def car(self, Ts: Array, moving: bool, kind: str = "") -> None:
+        """Add a car on the road at `Ts`, of a random kind unless told; its height is set here."""
         kind = kind or str(self.rng.choice(list(SHAPES), p=(0.32, 0.32, 0.24, 0.12)))
-        mesh = self._shapes[kind].painted_as(_PAINTS[self.rng.integers(0, len(_PAINTS))])
+        mesh = self._shapes[kind].painted_as(CAR_PAINTS[self.rng.integers(0, len(CAR_PAINTS))])
         Ts = Ts.copy()
         Ts[:, 1, 3] = -SHAPES[kind].size_m[1] / 2
         self.actors.append(Actor(len(self.actors) + 1, "car", mesh, Ts, moving))
 
-    def _walker(self, Ts: Array) -> None:
+    def walker(self, Ts: Array) -> None:
+        """Add a person whose soles are at `Ts`."""
         mesh = self._walkers[self.rng.integers(0, len(self._walkers))]
         _, high = mesh.bounds()
         Ts = Ts.copy()
         Ts[:, 1, 3] -= high[1]
         self.actors.append(Actor(len(self.actors) + 1, "person", mesh, Ts, True))
 
-    def _follow(self, s: Array, lateral: Along, direction: int = 1, y: float = 0.0) -> Array:
+    def follow(self, s: Array, lateral: Along, direction: int = 1, y: float = 0.0) -> Array:
         """Poses of something that drives or walks along `lateral(s)`, facing its way."""
         x, z, psi = self.road.at(s, lateral(s))
         slope = np.arctan((lateral(s + 0.05) - lateral(s - 0.05)) / 0.1)
@@ -136,7 +139,7 @@ class _Script:
         for side, lateral in enumerate(_PARKED):
             for s in np.arange(-8.0, self.road.end_s - 25, 6.1):
                 local = s % BLOCK_M
-                junction = abs(local - (_CROSSING_S + _ZEBRA_S) / 2) < 14
+                junction = abs(local - (CROSSING_S + ZEBRA_S) / 2) < 14
                 taken = side == 0 and abs(local - 24) < 7
                 if junction or taken or self.rng.random() < 0.28:
                     continue
@@ -146,43 +149,43 @@ class _Script:
                 off = lateral + self.rng.uniform(-0.12, 0.12)
                 turn = self.rng.uniform(-0.03, 0.03) + (np.pi if side == 0 else 0)
                 T = self.road.pose(place, off, 0.0, turn)
-                self._car(np.repeat(T[None], len(self.times), 0), moving=False)
+                self.car(np.repeat(T[None], len(self.times), 0), moving=False)
 
     def lead(self) -> None:
         s = _ego_s(self.times) + 15.5 + 2.5 * np.sin(0.32 * self.times)
-        self._car(self._follow(s, lambda s: 0.1 * np.sin(s / 19)), True, "hatchback")
+        self.car(self.follow(s, lambda s: 0.1 * np.sin(s / 19)), True, "hatchback")
 
     def block(self, block: int) -> None:
         s0 = block * BLOCK_M
         tau = self.times - _ego_time(s0)
         constant = partial(np.full_like, dtype=float)
         overtaking = _ego_s(self.times) - 3.0 + 5.0 * tau
-        self._car(self._follow(overtaking, lambda s: constant(s, _LEFT_LANE)), True, "saloon")
+        self.car(self.follow(overtaking, lambda s: constant(s, LEFT_LANE)), True, "saloon")
         oncoming = s0 + 56 - 8.5 * tau
-        self._car(self._follow(oncoming, lambda s: constant(s, _ONCOMING), -1), True, "estate")
-        self._car(self._turning(s0, tau), True, "saloon")
+        self.car(self.follow(oncoming, lambda s: constant(s, ONCOMING), -1), True, "estate")
+        self.car(self._turning(s0, tau), True, "saloon")
         stopping = s0 + _stopping_s(tau)
-        self._car(self._follow(stopping, lambda s: constant(s, _ONCOMING), -1), True, "van")
+        self.car(self.follow(stopping, lambda s: constant(s, ONCOMING), -1), True, "van")
         out = np.maximum(tau - 0.2, 0)
         driven = np.where(out < 2.8, 1.1 * out**2, 8.624 + 6.16 * (out - 2.8))
 
         def from_kerb(s: Array) -> Array:
             share = np.clip((s0 + 24 - s) / 9.0, 0, 1)
-            return _PARKED[0] + (_ONCOMING - _PARKED[0]) * share**2 * (3 - 2 * share)
+            return _PARKED[0] + (ONCOMING - _PARKED[0]) * share**2 * (3 - 2 * share)
 
-        self._car(self._follow(s0 + 24 - driven, from_kerb, -1), True, "hatchback")
+        self.car(self.follow(s0 + 24 - driven, from_kerb, -1), True, "hatchback")
         self._crossing_walker(s0, tau)
 
     def _turning(self, s0: float, tau: Array) -> Array:
         """Oncoming car that turns into the side street on the left of the camera."""
         radius, lane = 5.0, 1.75
-        straight = 73.75 - (_CROSSING_S + lane + radius)
+        straight = 73.75 - (CROSSING_S + lane + radius)
         d = np.where(tau < 2.0, 7.0 * tau, 14 + 4.4 * (tau - 2.0))
         angle = np.clip((d - straight) / radius, 0, np.pi / 2)
         before = np.minimum(d, straight)
         after = np.maximum(d - straight - radius * np.pi / 2, 0)
         s = s0 + 73.75 - before - radius * np.sin(angle)
-        lateral = _ONCOMING - radius * (1 - np.cos(angle)) - after
+        lateral = ONCOMING - radius * (1 - np.cos(angle)) - after
         x, z, psi = self.road.at(s, lateral)
         return np.stack(
             [pose(a, 0, b, c) for a, b, c in zip(x, z, psi + np.pi + angle, strict=True)]
@@ -190,9 +193,9 @@ class _Script:
 
     def _crossing_walker(self, s0: float, tau: Array) -> None:
         lateral = np.clip(-1.0 - 1.5 * tau, -12.3, 4.9)
-        x, z, psi = self.road.at(np.full_like(tau, s0 + _ZEBRA_S), lateral)
+        x, z, psi = self.road.at(np.full_like(tau, s0 + ZEBRA_S), lateral)
         rows = zip(x, z, psi - np.pi / 2, strict=True)
-        self._walker(np.stack([pose(a, 0, b, c) for a, b, c in rows]))
+        self.walker(np.stack([pose(a, 0, b, c) for a, b, c in rows]))
 
     def people(self) -> None:
         """Walkers on both pavements, about one every 9 m, some with and some against the camera."""
@@ -202,8 +205,8 @@ class _Script:
             direction = 1 if self.rng.random() < 0.5 else -1
             speed = self.rng.uniform(1.0, 1.6)
             along = s + self.rng.uniform(-2, 2) + direction * speed * self.times
-            self._walker(
-                self._follow(along, partial(np.full_like, fill_value=lateral), direction, -_KERB_M)
+            self.walker(
+                self.follow(along, partial(np.full_like, fill_value=lateral), direction, -KERB_M)
             )
 
 
@@ -218,11 +221,12 @@ def _stopping_s(tau: Array) -> Array:
     return 90 - braked - gained * (tau > wait)
 
 
-def _static(road: Road, rng: np.random.Generator) -> Mesh:
+def street_static(road: Road, rng: np.random.Generator) -> Mesh:
+    """All that stands still along a road: ground, markings, houses and furniture."""
     ends = (road.start_s, road.end_s)
     junctions = [
-        k * BLOCK_M + _CROSSING_S for k in range(-1, int(road.end_s // BLOCK_M) + 1)
-        if road.start_s < k * BLOCK_M + _CROSSING_S < road.end_s - 30
+        k * BLOCK_M + CROSSING_S for k in range(-1, int(road.end_s // BLOCK_M) + 1)
+        if road.start_s < k * BLOCK_M + CROSSING_S < road.end_s - 30
     ]  # fmt: skip
     parts = [road.strip(ends, _KERBS, (0.0, 0.0), "asphalt", 4)]
     open_ends = [road.start_s, *(x for j in junctions for x in (j - 5.0, j + 5.0)), road.end_s]
@@ -230,10 +234,10 @@ def _static(road: Road, rng: np.random.Generator) -> Mesh:
         for side, (kerb, front) in enumerate(zip(_KERBS, _FRONTS, strict=True)):
             outward = -1 if side == 0 else 1
             edge = kerb + 0.18 * outward
-            parts.append(road.strip(s, (kerb, kerb), (0.0, _KERB_M), "concrete"))
-            parts.append(road.strip(s, (kerb, edge), (_KERB_M, _KERB_M), "concrete"))
+            parts.append(road.strip(s, (kerb, kerb), (0.0, KERB_M), "concrete"))
+            parts.append(road.strip(s, (kerb, edge), (KERB_M, KERB_M), "concrete"))
             behind = front + 0.9 * outward  # house fronts are chords of the bends: leave no gap
-            parts.append(road.strip(s, (edge, behind), (_KERB_M, _KERB_M), "paving"))
+            parts.append(road.strip(s, (edge, behind), (KERB_M, KERB_M), "paving"))
     x, z, _ = road.at(np.arange(*ends), 0.0)
     low, high = np.array([x.min() - 60, z.min()]), np.array([x.max() + 60, z.max()])
     centre, extent = (low + high) / 2, high - low
@@ -262,7 +266,7 @@ def _markings(road: Road, junctions: list[float]) -> list[Mesh]:
             for edge in (1.85, -8.25):
                 parts.append(road.strip((s, s + 1.0), (edge, edge + 0.1), lift, "paint"))
     for j in junctions:
-        zebra = j - _CROSSING_S + _ZEBRA_S
+        zebra = j - CROSSING_S + ZEBRA_S
         for lateral in np.arange(_KERBS[0] + 0.5, _KERBS[1] - 0.4, 1.0):
             bar = (zebra - 1.5, zebra + 1.5)
             parts.append(road.strip(bar, (lateral, lateral + 0.5), lift, "paint"))
@@ -280,9 +284,9 @@ def _side_street(road: Road, junction: float, rng: np.random.Generator) -> list[
         for edge, away in ((s[0], -1), (s[1], 1)):
             rim = sorted((edge, edge + 2.0 * away))
             span = (inner, outer)
-            parts.append(road.strip((rim[0], rim[1]), span, (_KERB_M,) * 2, "paving", 8))
+            parts.append(road.strip((rim[0], rim[1]), span, (KERB_M,) * 2, "paving", 8))
             x, z, _ = road.at(np.array([edge, edge]), np.array(span))
-            kerb = [[(a, -_KERB_M, b), (a, 0, b)] for a, b in zip(x, z, strict=True)]
+            kerb = [[(a, -KERB_M, b), (a, 0, b)] for a, b in zip(x, z, strict=True)]
             parts.append(surface(kerb, "concrete"))
         begin = (_FRONTS[0] - 8.9) if outward < 0 else (_FRONTS[1] + 8.9)
         for k in range(2):
@@ -314,7 +318,7 @@ def _terrace(
             direction = np.array([x[b] - x[a], z[b] - z[a]])
             yaw = np.arctan2(-direction[1], direction[0])
             block = house(float(np.hypot(*direction)), 9.0, rng)
-            parts.append(block.placed(pose(x[a], -_KERB_M + 0.03, z[a], yaw)))
+            parts.append(block.placed(pose(x[a], -KERB_M + 0.03, z[a], yaw)))
     end = road.pose(road.end_s - 6, _FRONTS[0] - 2)
     parts.append(house(26, 9, rng, True).placed(end))
     return parts
@@ -323,7 +327,7 @@ def _terrace(
 def _street_furniture(road: Road, junctions: list[float], rng: np.random.Generator) -> list[Mesh]:
     parts = []
     trees = [tree(rng, rng.uniform(5.8, 7.4)) for _ in range(4)]
-    y = -_KERB_M
+    y = -KERB_M
     for side, (kerb, inward) in enumerate(zip(_KERBS, (1, -1), strict=True)):
         line = kerb - 0.75 * inward
         for k, s in enumerate(np.arange(road.start_s + 5 + 4 * side, road.end_s - 10, 11.5)):
@@ -352,7 +356,7 @@ def _street_furniture(road: Road, junctions: list[float], rng: np.random.Generat
                     road_sign(sign).placed(road.pose(s + 3.5, line, y, 0 if side else np.pi))
                 )
     for j in junctions:
-        zebra = j - _CROSSING_S + _ZEBRA_S
+        zebra = j - CROSSING_S + ZEBRA_S
         parts.append(traffic_light().placed(road.pose(zebra - 2.7, _KERBS[1] + 0.5, y)))
         parts.append(road_sign("crossing").placed(road.pose(zebra - 1.7, _KERBS[1] + 0.6, y)))
         parts.append(traffic_light().placed(road.pose(j + 6.8, _KERBS[0] - 0.5, y, np.pi)))

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.datasets.simulated.meshes import Mesh
 from pipelines.datasets.simulated.textures import Texture
@@ -21,7 +22,9 @@ class Actor:
     """An instance of a movable class.
 
     object_id: its label, 1 to 255. mesh: in its own frame. Ts_scene_object: (N + 1, 4, 4), one
-    more than there are frames. moving: whether it ever moves in the sequence.
+    more than there are frames. moving: whether it ever moves in the sequence. present: (N + 1,)
+    frames in which it is there at all, None for always; its poses run on beyond, so that the flow
+    out of its last frame is that of its motion.
     """
 
     object_id: int
@@ -29,6 +32,11 @@ class Actor:
     mesh: Mesh
     Ts_scene_object: Array
     moving: bool
+    present: NDArray[np.bool_] | None = None
+
+    def is_present(self, index: int) -> bool:
+        """Whether the actor is there in frame `index`."""
+        return self.present is None or bool(self.present[index])
 
 
 @dataclass(frozen=True, slots=True)

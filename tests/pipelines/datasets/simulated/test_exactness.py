@@ -40,12 +40,26 @@ def test_world_is_the_first_camera(exact):
 
 
 def test_flow_is_depth_moved_by_the_true_motion(exact):
-    """Back-project frame 1, move each label by its truth, project: the flow of frame 2."""
-    camera, truth = exact.camera, exact.ground_truth()
-    before, after = exact.read(1), exact.read(2)
+    check_flow(exact, 1)
+
+
+def test_flow_before_a_standing_camera_is_the_motion_of_objects(crossing):
+    check_flow(crossing, 1)
+    flow, still = crossing.read(2).flow_prev_to_curr_px, crossing.read(1).instance_labels == 0
+    assert np.abs(flow[still & np.isfinite(flow[..., 0])]).max() < 1e-4
+
+
+def test_flow_of_replayed_traffic_is_its_motion(replayed):
+    check_flow(replayed, 8)
+
+
+def check_flow(sequence, k):
+    """Back-project frame k, move each label by its truth, project: the flow of frame k + 1."""
+    camera, truth = sequence.camera, sequence.ground_truth()
+    before, after = sequence.read(k), sequence.read(k + 1)
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    now, later = object_poses(truth, 1), object_poses(truth, 2)
-    world = backprojected(camera, before.depth_m.astype(float)) @ truth.Ts_world_camera[1].T
+    now, later = object_poses(truth, k), object_poses(truth, k + 1)
+    world = backprojected(camera, before.depth_m.astype(float)) @ truth.Ts_world_camera[k].T
     seen_moving = 0
     for label in np.unique(before.instance_labels):
         mine = before.instance_labels == label
@@ -53,7 +67,7 @@ def test_flow_is_depth_moved_by_the_true_motion(exact):
             H = later[label] @ np.linalg.inv(now[label])
             seen_moving += np.abs(H - np.eye(4)).max() > 1e-3
             world[mine] = world[mine] @ H.T
-    p = world @ np.linalg.inv(truth.Ts_world_camera[2]).T
+    p = world @ np.linalg.inv(truth.Ts_world_camera[k + 1]).T
     q = p[..., :3] @ K.T
     expected = q[..., :2] / q[..., 2:] - np.stack(grid(camera), -1)
     known = np.isfinite(before.depth_m) & (q[..., 2] > 0)
