@@ -38,7 +38,6 @@ def forward_backward_error(
         np.where(inside, there_u, 0),
         np.where(inside, there_v, 0),
         cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,  # else a NaN or 0 beyond the last row would mix in
     )
     error = np.linalg.norm(flow + returned, axis=2)
     error[~inside] = np.inf

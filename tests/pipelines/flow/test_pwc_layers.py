@@ -13,7 +13,7 @@ torch = pytest.importorskip("torch", reason="needs torch; `python3 -m app test` 
 
 from torch.nn import functional as F  # noqa: E402, N812
 
-from pipelines.flow.pwc_layers import PwcNetwork, correlate, warp  # noqa: E402
+from pipelines.flow.pwc_layers import PwcNetwork, _volume, correlate, warp  # noqa: E402
 
 # Name -> inputs, outputs, stride, dilation, and size of the output on an image of 64 x 128.
 CONVOLUTIONS = {
@@ -94,6 +94,14 @@ def test_cost_volume_peaks_at_the_displacement() -> None:
     second = torch.roll(first, (2, -3), dims=(2, 3))  # what was at x is at x + (-3, 2)
     best = correlate(first, second)[0, :, 6:-6, 6:-6].argmax(0)
     assert (best == (2 + 4) * 9 + (-3 + 4)).all()
+
+
+def test_negative_costs_are_damped() -> None:
+    """Features of natural pairs have hardly any, so that the whole pass does not show it."""
+    first, second = torch.tensor(rand(0, 1, 7, 6, 11)), torch.tensor(rand(1, 1, 7, 6, 11))
+    costs = correlate(first, second)
+    assert (costs < 0).float().mean() > 0.1
+    torch.testing.assert_close(_volume(first, second), torch.where(costs > 0, costs, 0.1 * costs))
 
 
 def test_cost_volume_of_a_batch_is_that_of_each() -> None:
