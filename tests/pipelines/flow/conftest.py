@@ -13,6 +13,7 @@ def pwc_weights(tmp_path_factory) -> Path:
     torch = pytest.importorskip("torch", reason="needs torch; `python3 -m app test` installs it")
     from pipelines.flow.pwc_layers import PwcNetwork
 
+    torch.set_num_threads(1)  # on a busy machine two threads mostly wait for each other
     generator = torch.Generator().manual_seed(0)
     weights = {}
     for name, shape in ((name, value.shape) for name, value in PwcNetwork().state_dict().items()):
