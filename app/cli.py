@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from importlib import import_module
 
 from app import bootstrap
-from app.environment import CORE, DEVELOPMENT
+from app.environment import CORE, DEVELOPMENT, TORCH
 
 PROGRAM = "python3 -m app"
 LATEST = "results/latest"
@@ -86,7 +86,7 @@ datasets vdo""",
         """\
 test                            # everything
 test -k config -x               # pytest's flags""",
-        (CORE, DEVELOPMENT),
+        (CORE, DEVELOPMENT, TORCH),
     ),
 }
 

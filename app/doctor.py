@@ -111,7 +111,8 @@ def _packages(environment: Environment) -> Iterator[Finding]:
             words = "not set up yet; 'python3 -m app demo' does it"
             yield Finding(Verdict.NOTE, f"packages: {section}", words)
         else:
-            who = "'python3 -m app test'" if section == DEVELOPMENT else "what first needs them"
+            who = "'python3 -m app test'"
+            who += " or what first needs them" if section == TORCH else ""
             words = f"not installed; {who} brings them"
             yield Finding(Verdict.NOTE, f"packages: {section}", words)
     if not has_venv_module():

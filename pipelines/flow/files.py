@@ -15,7 +15,7 @@ class FilesFlow:
     """`compute` returns the frame's own flow."""
 
     def compute(
-        self, previous_gray: Image, gray: Image, given: NDArray[np.float32] | None = None
+        self, previous: Image, image: Image, given: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32] | None:
         """`given`, untouched; None where the frame brings none. See `pipelines.flow.Flow`."""
         return given

@@ -6,7 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from pipelines.config import FlowConfig
 from pipelines.errors import ConfigError
+from pipelines.flow import load_flow
 from pipelines.flow.dis import DisFlow
 
 WIDTH, HEIGHT = 320, 200
@@ -46,7 +48,7 @@ def test_check_empties_what_left_the_image_or_was_covered() -> None:
     before = texture()
     after, _ = moved(before, np.array([[1.0, 0, 24], [0, 1, 0]]))
     after[80:140, 60:120] = 128  # a board that was not there before
-    flow = DisFlow(check=True).compute(before, after)
+    flow = load_flow(FlowConfig(name="dis", check=True)).compute(before, after)
     unknown = np.isnan(flow).any(axis=2)
     assert unknown[20:-20, -20:].mean() > 0.9  # left the image
     assert unknown[90:130, 46:86].mean() > 0.3  # is under the board, which has no texture
@@ -68,11 +70,15 @@ def test_parts_of_larger_images_are_taken() -> None:
     assert np.abs(DisFlow().compute(part, part)).max() < 0.05
 
 
-def test_images_that_do_not_fit_together() -> None:
-    gray = texture()
-    with pytest.raises(ValueError, match="two grey images of one size"):
-        DisFlow().compute(gray, gray[:-1])
-    with pytest.raises(ValueError, match="two grey images"):
-        DisFlow().compute(np.dstack([gray] * 3), np.dstack([gray] * 3))
+def test_colour_images_count_by_their_grey_values() -> None:
+    rgb = np.dstack([texture(), texture()[::-1], texture()[:, ::-1]])
+    after = np.roll(rgb, 2, axis=1)
+    flow = DisFlow().compute(rgb, after)
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (rgb, after)]
+    np.testing.assert_array_equal(flow, DisFlow().compute(*grey))
+    assert abs(np.median(flow[20:-20, 20:-20, 0]) - 2) < 0.1
+
+
+def test_unknown_presets_are_refused() -> None:
     with pytest.raises(ConfigError, match="expected ultrafast, fast, medium, found 'slow'"):
         DisFlow("slow")
