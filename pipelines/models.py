@@ -183,7 +183,7 @@ def fetch_model(name: str, progress: Callable[[int, int], None] | None = None) -
     if not model.url:
         raise ModelError(f"{name}: there is no address to download it from; {how_to_get(name)}")
     with storing(name) as fresh:
-        _download(model.url, fresh, progress or (lambda done, total: None))
+        _download(name, fresh, progress or (lambda done, total: None))
         _check_against(fresh, model.sha256, f"{name}: what came from {model.url}")
     return model_path(name)
 
@@ -236,7 +236,8 @@ def _check_against(path: Path, expected: str, subject: str) -> None:
         )
 
 
-def _download(url: str, path: Path, progress: Callable[[int, int], None]) -> None:
+def _download(name: str, path: Path, progress: Callable[[int, int], None]) -> None:
+    url = MODELS[name].url
     try:
         with urllib.request.urlopen(url, timeout=_TIMEOUT_S) as reply, path.open("wb") as file:
             total, done = int(reply.headers.get("Content-Length") or 0), 0
@@ -247,8 +248,8 @@ def _download(url: str, path: Path, progress: Callable[[int, int], None]) -> Non
     except (urllib.error.URLError, http.client.HTTPException, TimeoutError, ConnectionError) as no:
         reason = getattr(no, "reason", None) or no
         raise ModelError(
-            f"cannot fetch {url} ({reason}); is there a network? A file that you bring from "
-            f"elsewhere comes in by `{_PROGRAM} add NAME FILE`"
+            f"cannot fetch {url} ({reason}); is there a network? A file that came another way "
+            f"is brought in by `{_PROGRAM} add {name} FILE`"
         ) from no
     if done < total:
         raise ModelError(f"{url}: expected {total} bytes, found {done}; try again")

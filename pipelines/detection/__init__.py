@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import difflib
 from importlib import import_module
+from pathlib import Path
 from typing import Protocol
 
 from pipelines.config import DetectorConfig
-from pipelines.errors import ConfigError
+from pipelines.errors import ConfigError, ModelError
 from pipelines.models import is_at_hand
 from pipelines.object_types import Detections
 from pipelines.types import Frame
@@ -70,9 +71,14 @@ def choose_detector(config: DetectorConfig, sequence_has_masks: bool) -> str:
 def _network_of(model: str) -> str:
     """Mask R-CNN answers whole-numbered labels; a YOLO network answers nothing but scores."""
     from pipelines.detection.onnx_network import OnnxNetwork
-    from pipelines.models import find_model
 
-    network = OnnxNetwork(find_model("yolo_seg", model))
+    path = Path(model).expanduser()
+    if not path.is_file():
+        raise ModelError(
+            f"detector.model: expected an ONNX file, found nothing at {path}; "
+            "`python3 -m app models` lists the networks and says how to get them"
+        )
+    network = OnnxNetwork(path)
     return "mask_rcnn" if any("int" in kind for kind in network.output_types) else "yolo_seg"
 
 

@@ -93,9 +93,9 @@ class MaskRcnn:
         if not single or len({len(array) for array in four}) != 1:
             found = ", ".join(f"{name} {a.dtype} {list(a.shape)}" for name, a in outputs.items())
             raise ModelError(
-                f"{self._network.path}: expected Mask R-CNN's outputs, boxes [N, 4], whole-numbered "
-                f"labels [N], scores [N] and masks [N, 1, h, w], found {found}; make the file by "
-                "`python3 -m app models export mask_rcnn`"
+                f"{self._network.path}: expected Mask R-CNN's outputs, boxes [N, 4], "
+                f"whole-numbered labels [N], scores [N] and masks [N, 1, h, w], found {found}; "
+                "make the file by `python3 -m app models export mask_rcnn`"
             )
         return four[0], four[1].astype(np.int64), four[2], four[3][:, 0]
 

@@ -1,8 +1,8 @@
 """torchvision's Mask R-CNN written as an ONNX file, from its published weights.
 
 Owns what is left out of the file: scaling the image, which `mask_rcnn` does, and pasting the masks
-into it, which is most of the work where there is no GPU. Needs torch and torchvision; nothing is
-downloaded here.
+into it, which is most of the work where there is no GPU. Needs torch, torchvision and onnx;
+nothing is downloaded here.
 """
 
 from __future__ import annotations
@@ -112,13 +112,9 @@ def _write_onnx(model: Any, path: Path) -> None:
 
 
 def _note_sides(path: Path) -> None:
-    """Append the sides that images are to be scaled to, as metadata of the file.
+    """Write into the file which sides images are to be scaled to, since it does not do that."""
+    import onnx
 
-    ONNX is a protocol buffer: fields may come in any order, so that one more entry of
-    `ModelProto.metadata_props` (field 14: StringStringEntryProto with key = 1, value = 2) can be
-    written behind the rest, without the onnx package.
-    """
-    key, value = SIDES_KEY.encode(), " ".join(map(str, SIDES_PX)).encode()
-    entry = bytes([0x0A, len(key)]) + key + bytes([0x12, len(value)]) + value
-    with path.open("ab") as file:
-        file.write(bytes([(14 << 3) | 2, len(entry)]) + entry)
+    network = onnx.load(path)
+    onnx.helper.set_model_props(network, {SIDES_KEY: " ".join(map(str, SIDES_PX))})
+    onnx.save(network, path)
