@@ -79,7 +79,9 @@ def _network_of(model: str) -> str:
             "`python3 -m app models` lists the networks and says how to get them"
         )
     network = OnnxNetwork(path)
-    return "mask_rcnn" if any("int" in kind for kind in network.output_types) else "yolo_seg"
+    return (
+        "mask_rcnn" if any("int" in kind for kind in network.output_types.values()) else "yolo_seg"
+    )
 
 
 def _unknown(name: str) -> ConfigError:
