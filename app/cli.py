@@ -80,6 +80,15 @@ config --set orb.n_features=1500""",
 datasets                        # names and expected files
 datasets vdo""",
     ),
+    "models": Verb(
+        "app.models:models",
+        "list the networks' files, fetch, add or make them",
+        """\
+models                          # which there are, which are at hand, licences
+models fetch mask_rcnn          # download torchvision's weights, and make the file
+models add yolo_seg yolov8n-seg.onnx
+models export mask_rcnn --weights my.pth --unchecked""",
+    ),
     "test": Verb(
         "app.checks:test",
         "run the linters, the type checker and the tests",
@@ -152,6 +161,7 @@ def build_parser() -> argparse.ArgumentParser:
         "doctor": _add_doctor,
         "config": _add_settings,
         "datasets": _add_datasets,
+        "models": _add_models,
         "test": _add_test,
     }
     for name, verb in VERBS.items():
@@ -246,6 +256,27 @@ def _add_doctor(parser: argparse.ArgumentParser) -> None:
 
 def _add_datasets(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", metavar="NAME", nargs="?", help="only this layout")
+
+
+def _add_models(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(action="list")
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions")
+    fetch = actions.add_parser("fetch", help="download a file, checked", allow_abbrev=False)
+    add = actions.add_parser("add", help="copy a file of your own in, checked", allow_abbrev=False)
+    export = actions.add_parser(
+        "export", help="make an ONNX file from weights (installs torch)", allow_abbrev=False
+    )
+    for name, action in (("fetch", fetch), ("add", add), ("export", export)):
+        lines = VERBS["models"].examples.splitlines()
+        action.examples = "\n".join(line for line in lines if line.startswith(f"models {name}"))
+        action.add_argument("name", metavar="NAME", help="as `models` lists them")
+        action.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add.add_argument("file", metavar="FILE")
+    export.add_argument("--weights", metavar="FILE", help="default: the published ones, fetched")
+    export.add_argument("--output", metavar="FILE", help="default: where `run` looks for it")
+    export.add_argument(
+        "--unchecked", action="store_true", help="take weights that are not the published ones"
+    )
 
 
 def _add_test(parser: argparse.ArgumentParser) -> None:

@@ -123,14 +123,16 @@ class MappingConfig:
 class DetectorConfig:
     """Step 1: instance masks of movable things."""
 
-    # auto: files where the sequence has masks, else yolo_seg or mask_rcnn where its model is at
-    # hand, else motion; or one of files, yolo_seg, mask_rcnn, motion
+    # auto: the network of `model` where that is set, else files where the sequence has masks, else
+    # yolo_seg or mask_rcnn where its model is at hand, else motion; or one of these four names
     name: str = "auto"
     model: str = ""  # path of the network's ONNX file, empty = where `models fetch` puts it
     every_n: int = 1  # the network runs on every n-th frame; between, masks are carried by flow
     min_score: float = 0.35  # detections below are dropped
     max_instances: int = 100  # the best are kept
-    input_width_px: int = 0  # px, images are scaled to this width for the network, 0 = its own
+    # px, images are scaled to this width for the network; 0 = its own, or for a yolo_seg network of
+    # any size that of the image, up to 1280
+    input_width_px: int = 0
     threads: int = 2  # of the network on the CPU
     # movable classes, by their COCO names; masks of other classes are not used
     classes: tuple[str, ...] = (
