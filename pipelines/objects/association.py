@@ -19,9 +19,10 @@ from pipelines.types import Array
 _MIN_VOTES = 0.3  # share of an object's points that a detection must hold
 _FEW_POINTS = 5  # fewer votes say little, boxes then count as well
 _MIN_OVERLAP = 0.2  # intersection over union with the predicted box, where points are few
-_GATE = 16.3  # chi-square, 3 degrees of freedom, 99.9 %
-_MAX_COLOR_DISTANCE = 0.75  # Hellinger, of something found again
-_IMPOSSIBLE = 1e6
+_GATE = 9.3  # chi-square, 3 degrees of freedom, 97.5 %
+_UNLIKELY = 20.0  # of distance2 + log_spread, where only the colour still counts
+_MAX_COLOR_DISTANCE = 0.6  # Hellinger, of something found again
+_NO_MATCH = 2.0  # what it costs to leave an object without a detection: more than any match
 _GROUPS = (
     frozenset({"car", "truck", "bus", "train", "van", "tram"}),
     frozenset({"person", "bicycle", "motorcycle"}),
@@ -34,7 +35,8 @@ class Candidates:
 
     votes: (J, M) how far the object's tracked points and the detection are the same, 0 without
     points; see `count_votes`. n_points: (J,) tracked points. overlap: (J, M) of the predicted box with the detection's.
-    distance2: (J, M) squared Mahalanobis distance of the centres, inf where unknown.
+    distance2: (J, M) squared Mahalanobis distance of the centres, inf where unknown. log_spread:
+    (J, M) logarithm of the determinant of its covariance: who may be anywhere is likely nowhere.
     color_distance: (J, M) Hellinger distance 0..1. same_kind: (J, M) whether classes agree.
     """
 
@@ -42,6 +44,7 @@ class Candidates:
     n_points: NDArray[np.int64]
     overlap: Array
     distance2: Array
+    log_spread: Array
     color_distance: Array
     same_kind: NDArray[np.bool_]
 
@@ -53,19 +56,20 @@ def assign(candidates: Candidates) -> NDArray[np.int64]:
     that an object in sight never loses its detection to one that is found again.
     """
     c = candidates
-    cost = np.full(c.votes.shape, _IMPOSSIBLE)
+    cost = np.full(c.votes.shape, _NO_MATCH)
     if cost.size == 0:
         return np.full(len(cost), -1, np.int64)
     again = (c.distance2 <= _GATE) & c.same_kind & (c.color_distance <= _MAX_COLOR_DISTANCE)
-    cost[again] = 1.0 + 0.5 * (c.distance2[again] / _GATE + c.color_distance[again])
+    unlikely = np.clip((c.distance2 + c.log_spread) / _UNLIKELY, 0.0, 0.99)
+    cost[again] = 1.0 + 0.6 * unlikely[again] + 0.4 * c.color_distance[again]
     near = (c.n_points[:, None] < _FEW_POINTS) & (c.overlap >= _MIN_OVERLAP) & c.same_kind
     cost = np.where(near, np.minimum(cost, 1.5 - c.overlap), cost)
     voted = (c.votes >= _MIN_VOTES) & (c.n_points[:, None] > 0)
     cost = np.where(voted, np.minimum(cost, 1.0 - c.votes), cost)
     rows, columns = linear_sum_assignment(cost)
     found = np.full(len(cost), -1, np.int64)
-    possible = cost[rows, columns] < _IMPOSSIBLE
-    found[rows[possible]] = columns[possible]
+    matched = cost[rows, columns] < _NO_MATCH
+    found[rows[matched]] = columns[matched]
     return found
 
 

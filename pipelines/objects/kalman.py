@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from pipelines.types import Array
 
 _MAX_TURN_RADPS = 1.0  # faster turns are noise of small objects, and would curl their prediction
-_GATE = 16.8  # chi-square, 6 degrees of freedom, 99 %
+_GATE = 11.3  # chi-square, 3 degrees of freedom, 99 %
 _TURN_MEMORY = 0.7  # share of the old turn rate that each measurement keeps
 
 
@@ -84,16 +84,21 @@ class ObjectFilter:
     ) -> None:
         """Take in a measured motion: centre (3,) now, mean velocity (3,) over the last step.
 
-        turn_radps: (3,) rotation vector per second, in the world. A measurement outside its 99 %
-        gate counts as less certain, just so much that it lies on the gate: one wild motion does
-        not carry the filter away, and several that agree do.
+        turn_radps: (3,) rotation vector per second, in the world. A centre or velocity outside
+        its 99 % gate counts as less certain, just so much that it lies about on the gate: one wild
+        motion does not carry the filter away, and several that agree do.
         """
-        R = np.zeros((6, 6))
-        R[:3, :3], R[3:, 3:] = center_covariance_m2, velocity_covariance
         z = np.r_[center_m, velocity_mps]
-        innovation = z - self._kf.x
-        distance2 = float(innovation @ np.linalg.solve(self._kf.P + R, innovation))
-        self._kf.update(z, R=R * max(1.0, distance2 / _GATE), H=np.eye(6))
+        R = np.zeros((6, 6))
+        for part, covariance in (
+            (slice(0, 3), center_covariance_m2),
+            (slice(3, 6), velocity_covariance),
+        ):
+            innovation = (z - self._kf.x)[part]
+            S = self._kf.P[part, part] + covariance
+            distance2 = float(innovation @ np.linalg.solve(S, innovation))
+            R[part, part] = covariance * max(1.0, distance2 / _GATE)
+        self._kf.update(z, R=R, H=np.eye(6))
         turn = _TURN_MEMORY * self.turn_radps + (1.0 - _TURN_MEMORY) * turn_radps
         self.turn_radps = turn * min(1.0, _MAX_TURN_RADPS / max(float(np.linalg.norm(turn)), 1e-9))
 
@@ -102,10 +107,17 @@ class ObjectFilter:
         H = np.hstack([np.eye(3), np.zeros((3, 3))])
         self._kf.update(center_m, R=covariance_m2, H=H)
 
-    def distance2(self, center_m: Array, covariance_m2: Array) -> float:
-        """Squared Mahalanobis distance of a centre (3,) seen with a covariance (3, 3)."""
-        d = center_m - self._kf.x[:3]
-        return float(d @ np.linalg.solve(self._kf.P[:3, :3] + covariance_m2, d))
+    def distances2(self, centers_m: Array, covariance_m2: Array) -> tuple[Array, float]:
+        """Squared Mahalanobis distances (M,) of centres (M, 3) seen with a covariance (3, 3).
+
+        And the logarithm of the determinant of their covariance, in m^6.
+        """
+        d = centers_m - self._kf.x[:3]
+        S = self._kf.P[:3, :3] + covariance_m2
+        return (
+            np.einsum("mi,mi->m", d, np.linalg.solve(S, d.T).T),
+            float(np.linalg.slogdet(S)[1]),
+        )
 
 
 def direction_std(vector: Array, covariance: Array) -> float:

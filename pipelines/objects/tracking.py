@@ -58,7 +58,7 @@ from pipelines.types import Array
 
 _FLOW_TOLERANCE_PX = 6.0  # alignment may move a point this far from its flow
 _CENTER_SIGMA_M = 0.3  # the visible part of an object has another centre from frame to frame
-_PART_SHARE = 0.5  # of an object's size by which the middle of what is seen of it may be off
+_PART_SHARE = 0.35  # of an object's size by which the middle of what is seen of it may be off
 _DETECTED_SIGMA_M = 1.0  # the centre of a mask, at its median depth
 _SEED_GRID_PX = 3  # grid on the previous image that is searched for a new object's pixels
 _LASTING_SHARE = 0.5  # of a speed's error stays from frame to frame, as its points do
@@ -191,7 +191,8 @@ class ObjectTracker:
         )
         boxes = np.array([self._tracks[i].box_px for i in ids]).reshape(J, 4)
         centers = transform_points(T_predicted, instances.centers_m)
-        distance2 = np.full((J, M), np.inf)
+        distance2, log_spread = np.full((J, M), np.inf), np.zeros((J, M))
+        known = np.flatnonzero(np.isfinite(centers[:, 0]))
         for j, object_id in enumerate(ids):
             track = self._tracks[object_id]
             if track.filter is None:
@@ -199,8 +200,7 @@ class ObjectTracker:
             # Any part of the object may be what is seen of it
             size_m = float(np.nan_to_num(track.extent_m).max())
             noise = max(_DETECTED_SIGMA_M, _PART_SHARE * size_m) ** 2 * np.eye(3)
-            for m in np.flatnonzero(np.isfinite(centers[:, 0])):
-                distance2[j, m] = track.filter.distance2(centers[m], noise)
+            distance2[j, known], log_spread[j] = track.filter.distances2(centers[known], noise)
         colors = np.array([self._tracks[i].color for i in ids])
         colors = colors.reshape(J, instances.colors.shape[1])
         kinds = same_kind(
@@ -211,6 +211,7 @@ class ObjectTracker:
             n_points,
             box_overlap(boxes, instances.boxes_px),
             distance2,
+            log_spread,
             color_distance(colors, instances.colors),
             kinds,
         )
@@ -506,7 +507,7 @@ class ObjectTracker:
             std = float(np.hypot(track.filter.speed_std_mps, _LASTING_SHARE * std_mps))
             state = decide_by_speed(self.config, track.state, speed, std)
         track.set_state(state, view.timestamp_s)
-        depth_m = float(np.linalg.norm(center - T_world_camera[:3, 3]))
+        depth_m = float(np.median(points.position_m[:, 2]))
         if 0.0 < self.config.max_depth_m < depth_m:
             table.add(
                 track, frame.scores[track.object_id], center_m=center, state=ObjectState.UNKNOWN
@@ -622,8 +623,8 @@ class ObjectTracker:
     def _coast(self, track: ObjectTrack, dt_s: float) -> None:
         if track.T_world_object is not None and track.filter is not None:
             # the filter has been moved on already: its motion takes the pose along
-            H = track.predicted_motion(dt_s)
-            track.T_world_object = H @ track.T_world_object
+            track.T_world_object = track.predicted_motion(dt_s) @ track.T_world_object
+            track.T_world_object[:3, 3] = track.filter.center_m
         track.H_world_curr_prev = None
 
     def _see_without_motion(
@@ -654,6 +655,8 @@ class ObjectTracker:
                 track.T_world_object = make_T(np.eye(3), center)
             else:
                 track.filter.update_center(center, covariance)
+                assert track.T_world_object is not None
+                track.T_world_object[:3, 3] = track.filter.center_m
         if track.state is not ObjectState.STOPPED:
             track.set_state(ObjectState.UNKNOWN, view.timestamp_s)
         table.add(track, frame.scores[track.object_id], center_m=center)
