@@ -129,8 +129,8 @@ class ObjectTruth:
 
     def __getitem__(self, which: NDArray) -> ObjectTruth:
         """The rows chosen by a boolean mask or an index array."""
-        values = (getattr(self, f.name) for f in fields(self))
-        return ObjectTruth(*(None if v is None else v[which] for v in values))
+        names = [f.name for f in fields(self) if getattr(self, f.name) is not None]
+        return ObjectTruth(**{name: getattr(self, name)[which] for name in names})
 
 
 @dataclass(frozen=True, slots=True)

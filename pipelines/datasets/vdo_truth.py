@@ -53,14 +53,16 @@ def read_object_truth(
                 strict=True,
             )
         )
-    if (root / "gt_objects.npz").is_file():
-        frame_index, object_id, Ts, moving = _read_npz(root / "gt_objects.npz", numbers)
-    elif len(rows) == 0:
+    exact = root / "gt_objects.npz"
+    if len(rows) == 0 and not exact.is_file():
         return None
+    mask_boxes, counts = _mask_boxes(len(numbers), read_mask)
+    if exact.is_file():
+        frame_index, object_id, Ts, moving = _read_npz(exact, numbers)
+        has_boxes = has_boxes and not counts  # the masks that it was made with show what is seen
     else:
         Ts = _kitti_Ts(rows, Ts_world_camera[frame_index]) if has_boxes else _world_Ts(rows)
         moving = ever_moves(object_id, times_s[frame_index], Ts[:, :3, 3])
-    mask_boxes, counts = _mask_boxes(len(numbers), read_mask)
     if not has_boxes:
         boxes = mask_boxes
     unseen = np.full(4, np.nan)
@@ -129,7 +131,7 @@ def _mask_boxes(
             continue
         places = [] if labels is None else find_objects(labels)
         for j, place in enumerate(places, start=1):
-            if place is not None:
+            if place is not None and labels is not None:
                 v, u = place
                 boxes[k, j] = np.array([u.start, v.start, u.stop - 1, v.stop - 1], np.float64)
                 counts[k, j] = int((labels[place] == j).sum())

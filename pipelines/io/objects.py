@@ -90,7 +90,7 @@ def write_object_trajectories(folder: Path | str, objects: ObjectEstimates) -> l
     disk refuses.
     """
     folder = Path(folder)
-    known = objects[np.isfinite(objects.Ts_world_object).all((1, 2))]
+    known = objects[np.flatnonzero(np.isfinite(objects.Ts_world_object).all((1, 2)))]
     written = []
     try:
         if len(known):
