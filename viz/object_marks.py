@@ -151,12 +151,12 @@ def place_labels(
             continue  # a parked car far away: its label would hide more than it tells
         others = [box for box in movers if box != own]
         taken = [label.box for label in placed]
-        places = [p for p in _near_places(own, size, (W, H), top_px) if not _hits(p, taken)]
+        places = [p for p in _near_places(own, size, (W, H), top_px) if not overlaps(p, taken)]
         # Rather a place that hides no other moving object, but rather such a one than none.
-        clear = [p for p in places if not _hits(p, others)]
+        clear = [p for p in places if not overlaps(p, others)]
         far = _far_places(own, size, (W, H), top_px) if moves and not places else iter(())
         box = next(iter(clear or places), None) or next(
-            (p for p in far if not _hits(p, taken)), None
+            (p for p in far if not overlaps(p, taken)), None
         )
         if box is not None:
             placed.append(Label(int(objects.object_id[row]), text, box, size_px, state))
@@ -203,7 +203,8 @@ def _pushed(box: Box, image: tuple[int, int], top: int) -> Box:
     return u, v, u + u1 - u0, v + v1 - v0
 
 
-def _hits(box: Box, others: list[Box]) -> bool:
+def overlaps(box: Box, others: list[Box]) -> bool:
+    """Whether `box` shares a pixel with one of the others."""
     return any(box[0] < o[2] and o[0] < box[2] and box[1] < o[3] and o[1] < box[3] for o in others)
 
 

@@ -49,16 +49,14 @@ def plot_object_speeds(figure: Any, result: Result) -> None:
     for axes, object_id in zip(grid.ravel(), shown, strict=False):
         own = objects[objects.object_id == object_id]
         seconds, color = own.timestamp_s - start_s, hex_color(style.object_color(object_id))
-        if object_id in truths:
-            stamps, speeds = truths[object_id]
-            axes.plot(stamps - start_s, speeds, color="#1c1c20", lw=3.2, alpha=0.22, label="truth")
         low, high = _interval(own)
         axes.fill_between(seconds, low, high, color=color, alpha=0.25, lw=0)
         axes.plot(seconds, KMH * own.smoothed_speed_mps, color=color, lw=1.6, label="filter, 95 %")
         measured = np.where(own.state == str(ObjectState.MOVING), KMH * own.speed_mps, np.nan)
-        axes.plot(
-            seconds, measured, ".", color=color, ms=4, mec="#1c1c20", mew=0.3, label="eq. (6)"
-        )
+        axes.plot(seconds, measured, ".", color=color, ms=5, mec="white", mew=0.4, label="eq. (6)")
+        if object_id in truths:
+            stamps, speeds = truths[object_id]
+            axes.plot(stamps - start_s, speeds, "--", color="#1c1c20", lw=1.1, label="truth")
         axes.set_title(f"{object_id} {own.class_name[-1]}", fontsize=10.5, loc="left")
         axes.set_ylim(0.0, _top_kmh(measured, KMH * own.smoothed_speed_mps, truths.get(object_id)))
     for axes in grid.ravel()[len(shown) :]:
@@ -69,8 +67,11 @@ def plot_object_speeds(figure: Any, result: Result) -> None:
         grid[lowest, column].tick_params(labelbottom=True)
     for row in grid:
         row[0].set_ylabel("km/h")
-    handles, names = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=3)
+    entries: dict[str, Any] = {}
+    for axes in grid.ravel():
+        handles, names = axes.get_legend_handles_labels()
+        entries |= dict(zip(names, handles, strict=True))
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=3)
     figure.suptitle("Speed of moving objects")
 
 
