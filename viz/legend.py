@@ -14,9 +14,10 @@ from pipelines.types import Image
 from viz import style
 from viz.lines import line_scale
 from viz.object_marks import Box
-from viz.scene import Scene, View
+from viz.scene import Polyline, Scene, View
 
 BAR_STEPS = (1.0, 2.0, 5.0)
+MOST_COLORS = 4  # in the sample of a legend entry for lines of many colours
 
 
 def draw_legend(
@@ -97,7 +98,10 @@ def _draw_key(
     import cv2
 
     text_px, margin = _sizes(view)
-    entries = {line.label: line for line in scene.polylines if line.label}
+    entries: dict[str, list[Polyline]] = {}
+    for line in scene.polylines:
+        if line.label:
+            entries.setdefault(line.label, []).append(line)
     if not entries:
         return []
     step, sample = round(1.6 * text_px), round(2.6 * text_px)
@@ -106,12 +110,14 @@ def _draw_key(
     pad = round(0.6 * text_px)
     box = (margin - pad, top - pad // 2, margin + width, view.size[1] - margin + pad)
     style.draw_panel(picture, box, panel)
-    for row, (label, line) in enumerate(reversed(entries.items())):
+    for row, (label, lines) in enumerate(reversed(entries.items())):
         v = top + row * step + step // 2
-        thick = max(1, round(line.width_px * line_scale(view)))
-        ends = (margin, v), (margin + sample, v)
-        color = style.on_dark(line.color) if dark else line.color
-        cv2.line(picture, *ends, color, thick, cv2.LINE_AA)
+        thick = max(1, round(lines[0].width_px * line_scale(view)))
+        colors = list(dict.fromkeys(line.color for line in lines))[:MOST_COLORS]
+        at_px = np.linspace(margin, margin + sample, len(colors) + 1).round().astype(int).tolist()
+        for color, left, right in zip(colors, at_px, at_px[1:], strict=False):
+            shown = style.on_dark(color) if dark else color
+            cv2.line(picture, (left, v), (right, v), shown, thick, cv2.LINE_AA)
         at = (margin + sample + text_px // 2, v + round(0.36 * text_px))
         style.draw_text(picture, label, at, text_px, ink)
     return [box]

@@ -66,7 +66,7 @@ def object_paths(objects: ObjectEstimates) -> tuple[list[Polyline], list[Tag]]:
         color = style.object_color(int(object_id))
         breaks = np.flatnonzero(np.diff(own.timestamp_s) > OBJECT_GAP_S) + 1
         pieces = [piece for piece in np.split(own.centers_m, breaks) if len(piece) > 1]
-        lines += [Polyline(piece, color, 3.0, "moving objects") for piece in pieces]
+        lines += [Polyline(piece, color, 2.6, "moving objects") for piece in pieces]
         speeds = KMH * own.speed_mps[-LAST_SPEEDS:]
         words = f"{object_id} {own.class_name[-1]}"
         if np.isfinite(speeds).any():

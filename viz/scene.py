@@ -72,7 +72,7 @@ def build_scene(result: Result, *, keyframe_every: int | None = None) -> Scene:
     up = _up(Ts)
     keep = near_path(result.static_points_m, path)
     points, colors = result.static_points_m[keep], result.static_colors[keep]
-    polylines: list[Polyline] = []
+    polylines, tags = object_paths(result.objects)  # below the camera's path, which they may hide
     if result.gt_Ts_world_camera is not None and result.gt_timestamps_s is not None:
         truth = result.gt_Ts_world_camera[:, :3, 3]
         polylines += [
@@ -85,8 +85,6 @@ def build_scene(result: Result, *, keyframe_every: int | None = None) -> Scene:
         polylines += [Polyline(f, style.FRUSTUM, 1.0) for f in frustums(Ts[::step], size_m)]
     for piece in split_at_gaps(result.timestamps_s, path[: len(Ts)]):
         polylines.append(Polyline(piece, style.ESTIMATE, 2.4, "camera, estimated"))
-    paths, tags = object_paths(result.objects)
-    polylines += paths
     return Scene(points, colors, path, tuple(polylines), up, _forward(Ts, up), tuple(tags))
 
 

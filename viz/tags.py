@@ -25,7 +25,7 @@ def draw_tags(
     text_px = min(max(10, round(0.82 * W / 75.0)), 34)
     radius = max(3, round(0.34 * text_px))
     ink, panel = (style.WHITE, style.BACKGROUNDS["black"]) if dark else (style.INK, style.WHITE)
-    taken = list(taken)
+    taken, seen = list(taken), []
     for tag in scene.tags:
         uv, depth = view.project(tag.point_m[None])
         if depth[0] <= 0 or not (0 <= uv[0, 0] < W and 0 <= uv[0, 1] < H):
@@ -33,6 +33,9 @@ def draw_tags(
         u, v = round(float(uv[0, 0])), round(float(uv[0, 1]))
         cv2.circle(picture, (u, v), radius + max(1, radius // 3), panel, -1, cv2.LINE_AA)
         cv2.circle(picture, (u, v), radius, tag.color, -1, cv2.LINE_AA)
+        taken.append((u - radius, v - radius, u + radius, v + radius))
+        seen.append((tag, u, v))
+    for tag, u, v in seen:
         w, h = style.text_size(tag.text, text_px)[0] + text_px // 2, round(1.3 * text_px)
         off = 2 * radius
         beside = ((u + off, v - h // 2), (u - off - w, v - h // 2))
