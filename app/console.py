@@ -159,10 +159,10 @@ def counting(what: str, quiet: bool = False) -> Iterator[Callable[[int, int], No
 
 def metrics(metrics: dict[str, Any], timings: dict[str, Any], folder: str) -> None:
     """What a run gave, as metrics.txt says it: counts, errors with units, times."""
-    from pipelines.evaluation.table import ERRORS, TIMES, metrics_text
+    from pipelines.evaluation.table import HEADINGS, metrics_text
 
     for line in metrics_text(metrics, timings).splitlines():
-        heading = line.startswith((ERRORS, TIMES))
+        heading = line.startswith(HEADINGS)
         stdout.print(Text(line, style="bold" if heading else ""), soft_wrap=True)
     say(f"\nResult: {folder}")
     if metrics.get("run", {}).get("interrupted"):

@@ -103,7 +103,8 @@ class ObjectTruth:
 
     frame_index, object_id: (M,) int64. class_name: (M,) str. Ts_world_object: (M, 4, 4).
     boxes_px: (M, 4) float64 x1 y1 x2 y2 of the visible part, NaN where out of sight.
-    moving: (M,) bool, whether the object ever moves in the sequence.
+    moving: (M,) bool, whether the object ever moves in the sequence. n_pixels: (M,) int64, how many
+    pixels of it are seen, or None where the truth has no masks.
     """
 
     frame_index: NDArray[np.int64]
@@ -112,9 +113,12 @@ class ObjectTruth:
     Ts_world_object: Array
     boxes_px: Array
     moving: NDArray[np.bool_]
+    n_pixels: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         M = len(self.frame_index)
+        if self.n_pixels is not None:
+            check_shape("ObjectTruth", "n_pixels", self.n_pixels, (M,))
         for name in ("frame_index", "object_id", "class_name", "moving"):
             check_shape("ObjectTruth", name, getattr(self, name), (M,))
         check_shape("ObjectTruth", "Ts_world_object", self.Ts_world_object, (M, 4, 4))
@@ -122,6 +126,11 @@ class ObjectTruth:
 
     def __len__(self) -> int:
         return len(self.frame_index)
+
+    def __getitem__(self, which: NDArray) -> ObjectTruth:
+        """The rows chosen by a boolean mask or an index array."""
+        names = [f.name for f in fields(self) if getattr(self, f.name) is not None]
+        return ObjectTruth(**{name: getattr(self, name)[which] for name in names})
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,22 +13,28 @@ from pipelines.io.result import Result
 from pipelines.types import Image
 from viz import style
 from viz.lines import line_scale
-from viz.scene import Scene, View
+from viz.object_marks import Box
+from viz.scene import Polyline, Scene, View
 
 BAR_STEPS = (1.0, 2.0, 5.0)
+MOST_COLORS = 4  # in the sample of a legend entry for lines of many colours
 
 
 def draw_legend(
     picture: Image, scene: Scene, view: View, result: Result, *, dark: bool = False
-) -> None:
-    """Title at the top left, legend below, scale bar at the bottom right where there is a scale."""
+) -> list[Box]:
+    """Title at the top left, legend below, scale bar at the bottom right where there is a scale.
+
+    Returns the parts of the picture (u0, v0, u1, v1) that they take.
+    """
     ink = style.WHITE if dark else style.INK
     panel = style.BACKGROUNDS["black" if dark else "white"]
-    _draw_ends(picture, scene, view, panel, dark)
-    _draw_title(picture, result, view, ink, panel)
-    _draw_key(picture, scene, view, ink, panel, dark)
+    taken = _draw_ends(picture, scene, view, panel, dark)
+    taken.append(_draw_title(picture, result, view, ink, panel))
+    taken += _draw_key(picture, scene, view, ink, panel, dark)
     if view.px_per_m is not None:
-        _draw_scale_bar(picture, view, ink, panel)
+        taken.append(_draw_scale_bar(picture, view, ink, panel))
+    return taken
 
 
 def scale_bar_m(px_per_m: float, longest_px: float) -> float:
@@ -69,7 +75,7 @@ def _sizes(view: View) -> tuple[int, int]:
     return text, round(1.2 * text)
 
 
-def _draw_title(picture: Image, result: Result, view: View, ink: Any, panel: Any) -> None:
+def _draw_title(picture: Image, result: Result, view: View, ink: Any, panel: Any) -> Box:
     text_px, margin = _sizes(view)
     lines = title_lines(result)
     sizes = [round(1.35 * text_px)] + [text_px] * (len(lines) - 1)
@@ -83,33 +89,41 @@ def _draw_title(picture: Image, result: Result, view: View, ink: Any, panel: Any
     for line, size, weight in zip(lines, sizes, weights, strict=True):
         v += round(1.45 * size)
         style.draw_text(picture, line, (margin, v - round(0.45 * size)), size, ink, weight)
+    return box
 
 
-def _draw_key(picture: Image, scene: Scene, view: View, ink: Any, panel: Any, dark: bool) -> None:
+def _draw_key(
+    picture: Image, scene: Scene, view: View, ink: Any, panel: Any, dark: bool
+) -> list[Box]:
     import cv2
 
     text_px, margin = _sizes(view)
-    entries = {line.label: line for line in scene.polylines if line.label}
+    entries: dict[str, list[Polyline]] = {}
+    for line in scene.polylines:
+        if line.label:
+            entries.setdefault(line.label, []).append(line)
     if not entries:
-        return
+        return []
     step, sample = round(1.6 * text_px), round(2.6 * text_px)
     width = sample + text_px + max(style.text_size(label, text_px)[0] for label in entries)
     top = view.size[1] - margin - step * len(entries)
     pad = round(0.6 * text_px)
-    style.draw_panel(
-        picture, (margin - pad, top - pad // 2, margin + width, view.size[1] - margin + pad), panel
-    )
-    for row, (label, line) in enumerate(reversed(entries.items())):
+    box = (margin - pad, top - pad // 2, margin + width, view.size[1] - margin + pad)
+    style.draw_panel(picture, box, panel)
+    for row, (label, lines) in enumerate(reversed(entries.items())):
         v = top + row * step + step // 2
-        thick = max(1, round(line.width_px * line_scale(view)))
-        ends = (margin, v), (margin + sample, v)
-        color = style.on_dark(line.color) if dark else line.color
-        cv2.line(picture, *ends, color, thick, cv2.LINE_AA)
+        thick = max(1, round(lines[0].width_px * line_scale(view)))
+        colors = list(dict.fromkeys(line.color for line in lines))[:MOST_COLORS]
+        at_px = np.linspace(margin, margin + sample, len(colors) + 1).round().astype(int).tolist()
+        for color, left, right in zip(colors, at_px, at_px[1:], strict=False):
+            shown = style.on_dark(color) if dark else color
+            cv2.line(picture, (left, v), (right, v), shown, thick, cv2.LINE_AA)
         at = (margin + sample + text_px // 2, v + round(0.36 * text_px))
         style.draw_text(picture, label, at, text_px, ink)
+    return [box]
 
 
-def _draw_scale_bar(picture: Image, view: View, ink: Any, panel: Any) -> None:
+def _draw_scale_bar(picture: Image, view: View, ink: Any, panel: Any) -> Box:
     import cv2
 
     assert view.px_per_m is not None
@@ -119,7 +133,8 @@ def _draw_scale_bar(picture: Image, view: View, ink: Any, panel: Any) -> None:
     length_px = round(length_m * view.px_per_m)
     left, right, v = W - margin - length_px, W - margin, H - margin - text_px // 4
     pad = round(0.6 * text_px)
-    style.draw_panel(picture, (left - pad, v - 2 * text_px - pad // 2, right + pad, v + pad), panel)
+    box = (left - pad, v - 2 * text_px - pad // 2, right + pad, v + pad)
+    style.draw_panel(picture, box, panel)
     tick, thick = text_px // 3, max(2, text_px // 7)
     for a, b in (
         ((left, v), (right, v)),
@@ -130,13 +145,15 @@ def _draw_scale_bar(picture: Image, view: View, ink: Any, panel: Any) -> None:
     label = f"{length_m:g} m"
     at = ((left + right - style.text_size(label, text_px)[0]) // 2, v - round(0.6 * text_px))
     style.draw_text(picture, label, at, text_px, ink)
+    return box
 
 
-def _draw_ends(picture: Image, scene: Scene, view: View, panel: Any, dark: bool) -> None:
+def _draw_ends(picture: Image, scene: Scene, view: View, panel: Any, dark: bool) -> list[Box]:
     """A disc and a word at the first and the last camera."""
     import cv2
 
     text_px, _ = _sizes(view)
+    taken: list[Box] = []
     ends = (("end", scene.path_m[-1:], style.END), ("start", scene.path_m[:1], style.START))
     apart_px = view.project(scene.path_m[-1:])[0][0] - view.project(scene.path_m[:1])[0][0]
     # Words of ends that are close go to different sides, or one would lie under the other's disc.
@@ -157,7 +174,8 @@ def _draw_ends(picture: Image, scene: Scene, view: View, panel: Any, dark: bool)
         if word == above or base + text_px // 3 > view.size[1]:
             base = v - r - round(0.5 * text_px)
         pad = text_px // 4
-        style.draw_panel(
-            picture, (left - pad, base - text_px, left + width + pad, base + pad + 1), panel, 0.7
-        )
+        box = (left - pad, base - text_px, left + width + pad, base + pad + 1)
+        style.draw_panel(picture, box, panel, 0.7)
         style.draw_text(picture, word, (left, base), text_px, color, 600)
+        taken += [box, (u - r, v - r, u + r, v + r)]
+    return taken

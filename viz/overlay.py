@@ -1,6 +1,6 @@
 """One annotated frame: what was seen, what the pose was measured with, and how it went.
 
-Owns the frame picture and the sink that writes it to files. Knows no 3-D scene.
+Owns the frame picture and the sink that writes it to files. Objects on it are `object_marks`'s.
 """
 
 from __future__ import annotations
@@ -23,22 +23,30 @@ from pipelines.io.folder import FRAMES
 from pipelines.io.timings import frame_total_ms
 from pipelines.types import Array, Frame, FrameResult, Image, TrackingStatus
 from viz import style
+from viz.object_marks import (
+    draw_mask,
+    draw_object_areas,
+    draw_object_labels,
+    object_counts,
+)
 
 logger = logging.getLogger("dyob.viz")
 
-MASK_OPACITY = 0.42
-
 
 def draw_frame(frame: Frame, result: FrameResult) -> Image:
-    """The frame's image with masks, ORB points and a status strip, (H, W, 3) uint8 RGB.
+    """The frame's image with objects, ORB points and a status strip, (H, W, 3) uint8 RGB.
 
     Green rings: keypoints that agree with the pose. Red crosses: map points that do not. Grey dots:
-    keypoints that observe no map point. Masks take the colour of their label.
+    keypoints that observe no map point. Objects have their lasting colour; what moves has a strong
+    mask, a box and its speed. Without tracked objects the frame's own masks are drawn.
     """
     image = frame.image
     canvas = np.repeat(image[..., None], 3, 2) if image.ndim == 2 else image.copy()
-    if frame.instance_labels is not None:
-        _draw_masks(canvas, frame.instance_labels)
+    if result.object_labels is not None:
+        draw_object_areas(canvas, result.objects, result.object_labels)
+    elif frame.instance_labels is not None:
+        for label in np.unique(frame.instance_labels[frame.instance_labels > 0]):
+            draw_mask(canvas, frame.instance_labels == label, int(label))
     radius_px = max(2.5, image.shape[0] / 130.0)
     tracked = result.point_ids >= 0
     uv = result.keypoints_px
@@ -49,6 +57,9 @@ def draw_frame(frame: Frame, result: FrameResult) -> Image:
     )
     for which, mark, size_px, color in groups:
         stamp_marks(canvas, uv[which], mark, size_px, color)
+    if result.object_labels is not None:
+        top_px = _strip_sizes(canvas)[1] + 1
+        draw_object_labels(canvas, result.objects, result.object_labels, top_px)
     _draw_status(canvas, result)
     return canvas
 
@@ -101,25 +112,10 @@ def _sprites(mark: str, radius_px: float) -> tuple[NDArray[np.float32], NDArray[
     return layers[0], layers[1]
 
 
-def _draw_masks(canvas: Image, labels: NDArray[np.int32]) -> None:
-    import cv2
-
-    for label in np.unique(labels[labels > 0]):
-        mask = labels == label
-        color = style.object_color(int(label))
-        tint = np.array(color, np.float32)
-        canvas[mask] = np.round(canvas[mask] * (1 - MASK_OPACITY) + tint * MASK_OPACITY)
-        contours, _ = cv2.findContours(
-            mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
-        )
-        cv2.drawContours(canvas, contours, -1, color, 2, cv2.LINE_AA)
-
-
 def _draw_status(canvas: Image, result: FrameResult) -> None:
     """A dark strip along the top; what does not fit into a narrow image is left out."""
-    H, W = canvas.shape[:2]
-    size_px = int(np.clip(min(H / 24.0, W / 46.0), 11, 28))
-    strip_px = round(1.75 * size_px)
+    W = canvas.shape[1]
+    size_px, strip_px = _strip_sizes(canvas)
     baseline = round(1.23 * size_px)
     style.draw_panel(canvas, (0, 0, W, strip_px), (14, 16, 20), 0.72)
     ok = result.status is TrackingStatus.OK
@@ -138,8 +134,17 @@ def _draw_status(canvas: Image, result: FrameResult) -> None:
         u += width
 
 
+def _strip_sizes(canvas: Image) -> tuple[int, int]:
+    """Height of the status strip's text, and of the strip, in pixels."""
+    H, W = canvas.shape[:2]
+    size_px = int(np.clip(min(H / 24.0, W / 46.0), 11, 28))
+    return size_px, round(1.75 * size_px)
+
+
 def _status_texts(result: FrameResult) -> list[str]:
     texts = [f"frame {result.frame_index}", f"{result.timestamp_s:.2f} s"]
+    if counts := object_counts(result.objects):
+        texts.append(counts)
     tracked = int((result.point_ids >= 0).sum())
     texts.append(f"{int(result.inliers.sum())} of {tracked} points agree")
     texts.append(hypothesis_words(result.hypothesis))

@@ -22,6 +22,8 @@ from pipelines.io.result import Result, load_result
 from pipelines.io.timings import TOTAL, WALL, stage_summaries
 from pipelines.types import Array
 from viz import style
+from viz.object_plots import moving_ids, plot_object_speeds, plot_object_timeline
+from viz.style import hex_color as _hex
 
 SETTINGS = {
     "font.size": 11,
@@ -40,7 +42,8 @@ def plot_result(folder: Path | str) -> list[Path]:
     """Write plots/*.png of a result folder, those that its files allow; the paths written.
 
     trajectory.png: the path from above, with the truth. rpe.png: error of every step. timings.png:
-    what a frame costs. Raises FormatError for a damaged folder.
+    what a frame costs. objects_speed.png and objects_timeline.png: moving objects, see
+    `object_plots`. Raises FormatError for a damaged folder.
     """
     result = load_result(folder)
     target = result.folder / names.PLOTS
@@ -53,6 +56,8 @@ def plot_result(folder: Path | str) -> list[Path]:
     jobs = [("trajectory.png", _plot_trajectory, len(result.timestamps_s) > 0)]
     jobs.append(("rpe.png", _plot_rpe, truth and len(result.timestamps_s) > 1))
     jobs.append(("timings.png", _plot_timings, bool(stage_summaries(result.timings))))
+    jobs.append(("objects_speed.png", plot_object_speeds, len(moving_ids(result.objects)) > 0))
+    jobs.append(("objects_timeline.png", plot_object_timeline, len(result.objects) > 0))
     for name, plot, possible in jobs:
         if possible:
             with _figure(target / name) as figure:
@@ -74,10 +79,6 @@ def _figure(path: Path) -> Iterator[Any]:
         yield figure
         with replacing(path) as fresh:
             figure.savefig(fresh)
-
-
-def _hex(color: style.Color) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*color)
 
 
 def _plot_trajectory(figure: Any, result: Result) -> None:

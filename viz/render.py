@@ -21,6 +21,7 @@ from viz.legend import draw_legend
 from viz.lines import draw_polyline
 from viz.overlay import write_image
 from viz.scene import Scene, View, build_scene, extent_m
+from viz.tags import draw_tags
 from viz.views import VIEW_NAMES, choose_view
 
 logger = logging.getLogger("dyob.viz")
@@ -67,7 +68,8 @@ def render_result(
     for view, picture in zip(chosen, pictures, strict=True):
         for line in scene.polylines:
             draw_polyline(picture, view, line, dark=dark)
-        draw_legend(picture, scene, view, result, dark=dark)
+        taken = draw_legend(picture, scene, view, result, dark=dark)
+        draw_tags(picture, view, scene, taken, dark=dark)
         path = target / f"map_{view.name}.png"
         write_image(path, picture)
         written.append(path)

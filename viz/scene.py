@@ -15,22 +15,12 @@ from pipelines.geometry import transform_points
 from pipelines.io.result import Result
 from pipelines.types import Array
 from viz import style
+from viz.object_paths import Polyline, Tag, object_paths, split_at_gaps
 
 STRAY_QUANTILE = 0.95  # of the points' distances to the path: what lies far beyond is stray
 STRAY_FACTOR = 1.6
 N_FRUSTUMS = 15
 FRUSTUM_SHARE = 0.013  # frustum depth as a share of the scene's extent
-GAP_FACTOR = 1.5  # median frame intervals; a longer one breaks the drawn path
-
-
-@dataclass(frozen=True, slots=True)
-class Polyline:
-    """Connected points (N, 3) in metres, drawn `width_px` wide; with a label, in the legend."""
-
-    points_m: Array
-    color: style.Color
-    width_px: float
-    label: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +29,7 @@ class Scene:
 
     points_m: (N, 3) without stray far points. colors: (N, 3) uint8. path_m: (F, 3) camera centres
     in order. up: (3,) unit vector. forward: (3,) unit, across up: where the camera looked first.
+    tags: one at the end of each moving object's path.
     """
 
     points_m: Array
@@ -47,6 +38,7 @@ class Scene:
     polylines: tuple[Polyline, ...]
     up: Array
     forward: Array
+    tags: tuple[Tag, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +63,7 @@ class View:
 
 
 def build_scene(result: Result, *, keyframe_every: int | None = None) -> Scene:
-    """Scene of a result: map points, the estimated and the true path, and some camera frustums.
+    """Scene of a result: points, the estimated and the true path, moving objects, some frustums.
 
     keyframe_every: a frustum at every n-th pose; by default about fifteen along the path.
     """
@@ -80,7 +72,7 @@ def build_scene(result: Result, *, keyframe_every: int | None = None) -> Scene:
     up = _up(Ts)
     keep = near_path(result.static_points_m, path)
     points, colors = result.static_points_m[keep], result.static_colors[keep]
-    polylines: list[Polyline] = []
+    polylines, tags = object_paths(result.objects)  # below the camera's path, which they may hide
     if result.gt_Ts_world_camera is not None and result.gt_timestamps_s is not None:
         truth = result.gt_Ts_world_camera[:, :3, 3]
         polylines += [
@@ -93,7 +85,7 @@ def build_scene(result: Result, *, keyframe_every: int | None = None) -> Scene:
         polylines += [Polyline(f, style.FRUSTUM, 1.0) for f in frustums(Ts[::step], size_m)]
     for piece in split_at_gaps(result.timestamps_s, path[: len(Ts)]):
         polylines.append(Polyline(piece, style.ESTIMATE, 2.4, "camera, estimated"))
-    return Scene(points, colors, path, tuple(polylines), up, _forward(Ts, up))
+    return Scene(points, colors, path, tuple(polylines), up, _forward(Ts, up), tuple(tags))
 
 
 def near_path(points_m: Array, path_m: Array) -> NDArray[np.bool_]:
@@ -104,15 +96,6 @@ def near_path(points_m: Array, path_m: Array) -> NDArray[np.bool_]:
     distance = np.full(len(points_m), np.inf)
     distance[finite] = cKDTree(path_m).query(points_m[finite])[0]
     return distance <= STRAY_FACTOR * np.quantile(distance[finite], STRAY_QUANTILE)
-
-
-def split_at_gaps(timestamps_s: Array, points_m: Array) -> list[Array]:
-    """The path (N, 3) in pieces that end where frames are missing in time."""
-    if len(points_m) < 2:
-        return [points_m] if len(points_m) else []
-    steps_s = np.diff(timestamps_s)
-    breaks = np.flatnonzero(steps_s > GAP_FACTOR * np.median(steps_s)) + 1
-    return np.split(points_m, breaks)
 
 
 def frustums(Ts_world_camera: Array, size_m: float) -> list[Array]:

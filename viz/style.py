@@ -42,6 +42,7 @@ OBJECT_COLORS: tuple[Color, ...] = (
     (120, 110, 220),
     (170, 220, 90),
 )
+DARKEST = 0.27  # lightness of an object's colour: a darker one would be lost on a shaded picture
 BACKGROUNDS: dict[str, Color] = {"white": WHITE, "black": (16, 18, 22)}
 
 
@@ -58,6 +59,17 @@ def on_dark(color: Color) -> Color:
     return ON_DARK.get(color, color)
 
 
+def ink_on(color: Color) -> Color:
+    """White or the dark ink, whichever is the more legible on the colour."""
+    r, g, b = color
+    return INK if 0.299 * r + 0.587 * g + 0.114 * b > 125 else WHITE
+
+
+def hex_color(color: Color) -> str:
+    """The colour as "#rrggbb"."""
+    return "#{:02x}{:02x}{:02x}".format(*color)
+
+
 def object_color(object_id: int) -> Color:
     """The colour of an object, the same in every picture and run: it depends on its id alone."""
     base = OBJECT_COLORS[(object_id - 1) % len(OBJECT_COLORS)]
@@ -66,7 +78,7 @@ def object_color(object_id: int) -> Color:
         return base
     # Past the palette's end the hues are taken again, darker by steps and slightly turned.
     hue, lightness, saturation = colorsys.rgb_to_hls(*(channel / 255.0 for channel in base))
-    lightness *= (0.72, 0.88, 0.58)[(turn - 1) % 3]
+    lightness = max(lightness * (0.72, 0.88, 0.58)[(turn - 1) % 3], DARKEST)
     red, green, blue = colorsys.hls_to_rgb((hue + 0.033 * turn) % 1.0, lightness, saturation)
     return round(255 * red), round(255 * green), round(255 * blue)
 

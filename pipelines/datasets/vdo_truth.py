@@ -14,7 +14,7 @@ from scipy.ndimage import find_objects
 from scipy.spatial.transform import Rotation
 
 from pipelines.datasets.truth import ever_moves, read_rows
-from pipelines.errors import DatasetError
+from pipelines.errors import DatasetError, FrameError
 from pipelines.types import Array, ObjectTruth
 
 Boxes = dict[tuple[int, int], Array]  # of (frame index, object id): x1 y1 x2 y2
@@ -33,7 +33,8 @@ def read_object_truth(
     gt_objects.npz (ids, moving, poses in the world for every frame) is exact and goes first.
     object_pose.txt comes as KITTI's `frame id x1 y1 x2 y2 x y z ry` in the camera of its frame
     (origin at the bottom centre, x along the length), or as `frame id x y z rx ry rz 0 0` in the
-    world (rotation vector). Boxes that no file states are those of the masks.
+    world (rotation vector). Boxes that no file states are those of the masks, which also say how
+    many pixels of an object are seen.
     """
     index_of = {number: i for i, number in enumerate(numbers)}
     rows: Array = np.empty((0, 10))
@@ -52,17 +53,20 @@ def read_object_truth(
                 strict=True,
             )
         )
-    if (root / "gt_objects.npz").is_file():
-        frame_index, object_id, Ts, moving = _read_npz(root / "gt_objects.npz", numbers)
-    elif len(rows) == 0:
+    exact = root / "gt_objects.npz"
+    if len(rows) == 0 and not exact.is_file():
         return None
+    mask_boxes, counts = _mask_boxes(len(numbers), read_mask)
+    if exact.is_file():
+        frame_index, object_id, Ts, moving = _read_npz(exact, numbers)
+        has_boxes = has_boxes and not counts  # the masks that it was made with show what is seen
     else:
         Ts = _kitti_Ts(rows, Ts_world_camera[frame_index]) if has_boxes else _world_Ts(rows)
         moving = ever_moves(object_id, times_s[frame_index], Ts[:, :3, 3])
     if not has_boxes:
-        boxes = _mask_boxes(len(numbers), read_mask)
+        boxes = mask_boxes
     unseen = np.full(4, np.nan)
-    keys = zip(frame_index.tolist(), object_id.tolist(), strict=True)
+    keys = list(zip(frame_index.tolist(), object_id.tolist(), strict=True))
     return ObjectTruth(
         frame_index=frame_index,
         object_id=object_id,
@@ -70,6 +74,7 @@ def read_object_truth(
         Ts_world_object=Ts,
         boxes_px=np.array([boxes.get(key, unseen) for key in keys]).reshape(-1, 4),
         moving=moving,
+        n_pixels=np.array([counts.get(key, 0) for key in keys], np.int64) if counts else None,
     )
 
 
@@ -113,13 +118,21 @@ def _world_Ts(rows: Array) -> Array:
     return Ts
 
 
-def _mask_boxes(n_frames: int, read_mask: Callable[[int], NDArray[np.int32] | None]) -> Boxes:
+def _mask_boxes(
+    n_frames: int, read_mask: Callable[[int], NDArray[np.int32] | None]
+) -> tuple[Boxes, dict[tuple[int, int], int]]:
+    """Boxes and numbers of pixels, by frame index and label, of all that the masks show."""
     boxes: Boxes = {}
+    counts: dict[tuple[int, int], int] = {}
     for k in range(n_frames):
-        labels = read_mask(k)
+        try:
+            labels = read_mask(k)
+        except FrameError:  # a run skips such a frame, and says so
+            continue
         places = [] if labels is None else find_objects(labels)
         for j, place in enumerate(places, start=1):
-            if place is not None:
+            if place is not None and labels is not None:
                 v, u = place
                 boxes[k, j] = np.array([u.start, v.start, u.stop - 1, v.stop - 1], np.float64)
-    return boxes
+                counts[k, j] = int((labels[place] == j).sum())
+    return boxes, counts

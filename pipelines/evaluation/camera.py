@@ -112,9 +112,9 @@ def _any_best_motion(est_m: Array, gt_m: Array) -> tuple[Array, Array]:
 
 def _ate(est: Array, gt: Array) -> dict[str, float | None]:
     if len(est) < 2:
-        return _statistics("ate", "m", np.empty(0))
+        return statistics("ate", "m", np.empty(0))
     aligned = align(est[:, :3, 3], gt[:, :3, 3])
-    return _statistics("ate", "m", np.linalg.norm(aligned - gt[:, :3, 3], axis=1))
+    return statistics("ate", "m", np.linalg.norm(aligned - gt[:, :3, 3], axis=1))
 
 
 def _rpe(est: Array, gt: Array, consecutive: NDArray[np.bool_]) -> dict[str, Any]:
@@ -124,8 +124,8 @@ def _rpe(est: Array, gt: Array, consecutive: NDArray[np.bool_]) -> dict[str, Any
     moved = len(E) > 0 and step_gt_m.mean() > 0
     return {
         "rpe_pairs": len(E),
-        **_statistics("rpe_trans", "m", np.linalg.norm(E[:, :3, 3], axis=1)),
-        **_statistics("rpe_rot", "deg", rotation_angle_deg(E)),
+        **statistics("rpe_trans", "m", np.linalg.norm(E[:, :3, 3], axis=1)),
+        **statistics("rpe_rot", "deg", rotation_angle_deg(E)),
         "step_length_ratio": float(step_est_m.mean() / step_gt_m.mean()) if moved else None,
     }
 
@@ -164,7 +164,8 @@ def _kitti(
     }
 
 
-def _statistics(name: str, unit: str, values: Array) -> dict[str, float | None]:
+def statistics(name: str, unit: str, values: Array) -> dict[str, float | None]:
+    """RMSE, mean, median and largest of `values` (N,), as keys; None where there are none."""
     if len(values) == 0:
         return {f"{name}_{kind}_{unit}": None for kind in ("rmse", "mean", "median", "max")}
     return {

@@ -1,6 +1,6 @@
 """Evaluation of a result folder: reads its files back and renews its metrics.
 
-Owns which files are compared with which. The definitions are in `pipelines.evaluation.camera`.
+Owns which files are compared with which. The definitions are in `camera` and `objects` beside it.
 """
 
 from __future__ import annotations
@@ -11,26 +11,51 @@ from typing import Any
 import numpy as np
 
 from pipelines.evaluation.camera import associate, evaluate_camera
+from pipelines.evaluation.object_truth import RunFrames
+from pipelines.evaluation.objects import evaluate_objects
 from pipelines.evaluation.table import metrics_text
 from pipelines.io.result import Result, ResultWriter, load_result
 from pipelines.types import Array
 
 
 def evaluate_result(folder: Path | str) -> dict[str, Any]:
-    """Renew the "camera" block of metrics.json and metrics.txt in a result folder; all its metrics.
+    """Renew metrics.json and metrics.txt of a result folder by its other files; all its metrics.
 
-    Without camera_gt_tum.txt there is no "camera" block. Other blocks stay as they are. Raises
-    FormatError where `folder` is no result folder or a file of it is damaged.
+    Without camera_gt_tum.txt there is no "camera" block, and without objects_gt.csv no "objects"
+    block. Other blocks stay as they are. Raises FormatError where `folder` is no result folder or a
+    file of it is damaged.
     """
     result = load_result(folder)
-    metrics = {key: value for key, value in result.metrics.items() if key != "camera"}
+    own = ("camera", "objects")
+    metrics = {key: value for key, value in result.metrics.items() if key not in own}
     if result.gt_Ts_world_camera is not None:
         metrics["camera"] = evaluate_camera(
             result.timestamps_s, result.Ts_world_camera, *truth_by_frame(result)
         )
+    if result.gt_objects is not None:
+        frames = processed_frames(result)
+        metrics["objects"] = evaluate_objects(result.objects, result.gt_objects, frames)
     writer = ResultWriter(result.folder)
     writer.write_metrics(metrics, metrics_text(metrics, result.timings))
     return metrics
+
+
+def processed_frames(result: Result) -> RunFrames:
+    """The frames that the run processed, with the true camera where it is known.
+
+    They are those of timings.json; without that file, those that objects.csv names, which lacks a
+    frame only where no object was tracked in it.
+    """
+    index = np.array(result.timings.get("frames_index", []), np.int64)
+    stamps = np.array(result.timings.get("frames_timestamp_s", []), float)
+    if len(index) == 0 or len(index) != len(stamps):
+        index, first = np.unique(result.objects.frame_index, return_index=True)
+        stamps = result.objects.timestamp_s[first]
+    Ts = np.full((len(index), 4, 4), np.nan)
+    if result.gt_timestamps_s is not None and result.gt_Ts_world_camera is not None:
+        rows, gt_rows = associate(stamps, result.gt_timestamps_s)
+        Ts[rows] = result.gt_Ts_world_camera[gt_rows]
+    return RunFrames(index, stamps, Ts)
 
 
 def truth_by_frame(result: Result) -> tuple[Array, Array]:

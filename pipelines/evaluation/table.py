@@ -12,7 +12,10 @@ from pipelines.io.timings import TOTAL, WALL, stage_summaries
 Row = tuple[str, ...]
 
 ERRORS = "Camera errors"
+OBJECTS = "Object errors"
+FOUND = "Objects found"
 TIMES = "Time a frame"
+HEADINGS = (ERRORS, OBJECTS, FOUND, TIMES)  # a block's first line begins with one of them
 STATISTICS = ("rmse", "mean", "median", "max")
 ERROR_ROWS = (  # label, unit, digits, keys of the statistics with {} for their name
     ("ATE, SE(3) aligned", "m", 4, "ate_{}_m"),
@@ -23,6 +26,14 @@ SINGLE_ROWS = (
     ("step_length_ratio", "Step length, estimate / truth", "", 4),
     ("kitti_t_rel_percent", "KITTI t_rel (100-800 m)", "%", 3),
     ("kitti_r_rel_deg_per_100m", "KITTI r_rel (100-800 m)", "deg in 100 m", 3),
+)
+OBJECT_ROWS = (  # label, unit, digits, block, keys of the statistics with {} for their name
+    ("Motion, translation", "m a frame", 4, "motion", "trans_{}_m"),
+    ("Motion, rotation", "deg a frame", 4, "motion", "rot_{}_deg"),
+    ("Speed", "km/h", 3, "speed", "error_{}_kmh"),
+    ("Speed, smoothed", "km/h", 3, "smoothed_speed", "error_{}_kmh"),
+    ("Pose, translation", "m", 4, "pose", "trans_{}_m"),
+    ("Pose, rotation", "deg", 3, "pose", "rot_{}_deg"),
 )
 TIMING_LABELS = {TOTAL: "all work, in two threads", WALL: "on the clock, with reading"}
 HYPOTHESES = {"pnp_ransac": "PnP RANSAC", "rgbd_odometry": "RGB-D odometry"}
@@ -45,6 +56,13 @@ def metrics_text(metrics: dict[str, Any], timings: dict[str, Any] | None = None)
         blocks.append(_block([heading, *errors, *singles]))
     else:
         blocks.append("No ground truth: no camera errors.")
+    objects, found = object_error_rows(metrics), object_facts(metrics)
+    if objects:
+        blocks.append(_block([(OBJECTS, "RMSE", "mean", "median", "largest", ""), *objects]))
+    if found:
+        width = max(len(label) for label, _ in found)
+        lines = [f"{label:<{width}}  {words}" for label, words in found]
+        blocks.append("\n".join([FOUND, *lines]))
     if times:
         blocks.append(_block([(TIMES, "median", "95 %", ""), *times]))
     return "\n\n".join(blocks) + "\n"
@@ -67,6 +85,12 @@ def run_facts(metrics: dict[str, Any]) -> list[Row]:
         rows.append(("Frames", words + (", stopped before the end" * bool(run.get("interrupted")))))
     if run.get("map_points") is not None:
         rows.append(("Map", f"{run['map_points']:,} points, {run.get('keyframes', 0)} keyframes"))
+    tracked = run.get("objects", {})
+    if tracked.get("tracked"):
+        kinds = sorted(tracked["by_class"].items(), key=lambda item: -item[1])
+        words = ", ".join(f"{count} {name}" for name, count in kinds)
+        moved = f", {tracked['moving']} of them seen moving"
+        rows.append(("Objects", f"{tracked['tracked']} tracked ({words}){moved}"))
     if run.get("hypotheses"):
         counts = sorted(run["hypotheses"].items(), key=lambda item: -item[1])
         rows.append(("Poses by", ", ".join(f"{hypothesis_words(n)} {c}" for n, c in counts)))
@@ -84,6 +108,44 @@ def error_rows(metrics: dict[str, Any]) -> list[Row]:
         values = [camera.get(key.format(name)) for name in STATISTICS]
         if values[0] is not None:
             rows.append((label, *("" if v is None else f"{v:.{digits}f}" for v in values), unit))
+    return rows
+
+
+def object_error_rows(metrics: dict[str, Any]) -> list[Row]:
+    """Rows (label, RMSE, mean, median, largest, unit) of the errors of moving objects."""
+    objects = metrics.get("objects", {})
+    rows = []
+    for label, unit, digits, block, key in OBJECT_ROWS:
+        values = [objects.get(block, {}).get(key.format(name)) for name in STATISTICS]
+        if values[0] is not None:
+            rows.append((label, *("" if v is None else f"{v:.{digits}f}" for v in values), unit))
+    return rows
+
+
+def object_facts(metrics: dict[str, Any]) -> list[Row]:
+    """Rows (label, words) of how many of the true objects were found, and of false ones."""
+    objects = metrics.get("objects")
+    if not objects:
+        return []
+    limits, coverage, speed = objects["limits"], objects["coverage"], objects["speed"]
+    rows: list[Row] = []
+    if coverage["truth"]:
+        words = f"{100 * coverage['share']:.1f} % ({coverage['found']} of {coverage['truth']}"
+        words += f" with > {limits['moving_kmh']:g} km/h within {limits['max_distance_m']:g} m)"
+        rows.append(("Coverage", words))
+    words = f"{objects['false_movers']} that stand still, {objects['ghosts']} that are nothing"
+    rows.append(("False movers", words))
+    if speed["signed_mean_kmh"] is not None:
+        words = f"{speed['signed_mean_kmh']:+.3f} km/h on average"
+        if speed["inside_95_share"] is not None:
+            words += f", {100 * speed['inside_95_share']:.0f} % inside the 95 % interval"
+        rows.append(("Speed off by", words))
+    for label, key in (("All tracks", "tracking"), ("Moving ones", "tracking_moving")):
+        tracking = objects[key]
+        if tracking["mota"] is not None:
+            words = f"MOTA {tracking['mota']:.3f}, IDF1 {tracking['idf1']:.3f}, "
+            words += f"{tracking['id_switches']} ID switches, "
+            rows.append((label, words + f"{tracking['fragmentations']} interruptions"))
     return rows
 
 

@@ -18,6 +18,9 @@ LOG = "run.log"
 CAMERA_TUM = "camera_tum.txt"
 CAMERA_KITTI = "camera_kitti.txt"
 CAMERA_GT_TUM = "camera_gt_tum.txt"
+OBJECTS_CSV = "objects.csv"
+OBJECTS_GT_CSV = "objects_gt.csv"
+OBJECTS = "objects"  # a folder: a trajectory an object
 STATIC_MAP = "static_map.ply"
 METRICS_JSON = "metrics.json"
 METRICS_TXT = "metrics.txt"
@@ -59,7 +62,9 @@ def clear_result_folder(folder: Path | str) -> None:
     folder = Path(folder)
     _check_output(folder)
     files = [CONFIG, LOG, CAMERA_TUM, CAMERA_KITTI, CAMERA_GT_TUM, STATIC_MAP]
+    files += [OBJECTS_CSV, OBJECTS_GT_CSV]
     stale = [folder / name for name in (*files, METRICS_JSON, METRICS_TXT, TIMINGS)]
+    stale += (folder / OBJECTS).glob("*_tum.txt")
     for name in (FRAMES, PLOTS, RENDERS):
         stale += [*(folder / name).glob("*.png"), *(folder / name).glob("*.jpg")]
     try:

@@ -9,7 +9,7 @@ import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,20 @@ from pipelines.geometry import invert_T, orthonormalise
 from pipelines.io import folder as names
 from pipelines.io.files import disk_error, read_json, read_yaml, write_json, write_text, write_yaml
 from pipelines.io.folder import create_result_folder, open_result_folder
+from pipelines.io.object_truth import read_object_truth, write_object_truth
+from pipelines.io.objects import read_objects, write_object_trajectories, write_objects
 from pipelines.io.ply import read_point_cloud, write_point_cloud
 from pipelines.io.timings import summarise_timings
 from pipelines.io.trajectory import read_tum, write_kitti, write_tum
-from pipelines.types import Array, FrameResult, GroundTruth, StaticMap, TrackingStatus
+from pipelines.object_types import ObjectEstimates, ObjectState
+from pipelines.types import (
+    Array,
+    FrameResult,
+    GroundTruth,
+    ObjectTruth,
+    StaticMap,
+    TrackingStatus,
+)
 
 __all__ = ["Result", "ResultWriter", "create_result_folder", "load_result", "run_metrics"]
 
@@ -77,11 +87,29 @@ class ResultWriter:
         write_tum(self.folder / names.CAMERA_TUM, *_stamped(ok))
         write_kitti(self.folder / names.CAMERA_KITTI, _stamped(results)[1])
 
+    def write_objects(self, results: Sequence[FrameResult]) -> None:
+        """objects.csv (a row per object and frame) and a trajectory per object in objects/."""
+        objects = ObjectEstimates.concatenate(*(r.objects for r in results))
+        write_objects(self.folder / names.OBJECTS_CSV, objects)
+        write_object_trajectories(self.folder / names.OBJECTS, objects)
+
     def write_ground_truth(self, results: Sequence[FrameResult], truth: GroundTruth) -> None:
-        """camera_gt_tum.txt: the truth of the frames that were run, moved into our world."""
-        stamps, Ts = _truth_of_run(results, truth)
-        if len(Ts):
-            write_tum(self.folder / names.CAMERA_GT_TUM, stamps, Ts)
+        """camera_gt_tum.txt and objects_gt.csv: the truth of the run, moved into our world.
+
+        The camera's is written from the first to the last processed frame, the objects' of the
+        processed frames alone, where the truth has any.
+        """
+        stamps, Ts, T_ours_theirs = _truth_of_run(results, truth)
+        if len(Ts) == 0:
+            return
+        write_tum(self.folder / names.CAMERA_GT_TUM, stamps, Ts)
+        if truth.objects is not None:
+            run = np.array([r.frame_index for r in results], np.int64)
+            objects = truth.objects[np.isin(truth.objects.frame_index, run)]
+            moved = replace(objects, Ts_world_object=T_ours_theirs @ objects.Ts_world_object)
+            all_stamps = np.asarray(truth.timestamps_s, float)
+            path = self.folder / names.OBJECTS_GT_CSV
+            write_object_truth(path, all_stamps[objects.frame_index], moved)
 
     def write_static_map(self, static_map: StaticMap) -> None:
         """static_map.ply: binary, with colours."""
@@ -102,8 +130,9 @@ class ResultWriter:
         static_map: StaticMap,
         truth: GroundTruth | None = None,
     ) -> None:
-        """All that the estimator knows so far: trajectories, map, timings, and the moved truth."""
+        """All that the estimator knows: trajectories, objects, map, timings; and the truth."""
         self.write_camera(results)
+        self.write_objects(results)
         self.write_timings(results)
         if truth is not None:
             self.write_ground_truth(results, truth)
@@ -123,6 +152,7 @@ class Result:
 
     timestamps_s: (N,) and Ts_world_camera: (N, 4, 4) of the measured frames. The same of the truth
     in our world, or None. static_points_m: (M, 3) float64, static_colors: (M, 3) uint8 RGB.
+    objects: all rows of objects.csv. gt_objects: the true ones in our world, or None.
     """
 
     folder: Path
@@ -135,6 +165,8 @@ class Result:
     metrics: dict[str, Any] = field(default_factory=dict)
     timings: dict[str, Any] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
+    objects: ObjectEstimates = field(default_factory=ObjectEstimates.empty)
+    gt_objects: ObjectTruth | None = None
 
 
 def load_result(path: Path | str) -> Result:
@@ -160,7 +192,15 @@ def load_result(path: Path | str) -> Result:
             (names.CONFIG, read_yaml),
         )
     )
-    return Result(folder, stamps, Ts, gt_stamps, gt_Ts, points, colors, metrics, timings, config)
+    objects, gt_objects = ObjectEstimates.empty(), None
+    if (folder / names.OBJECTS_CSV).exists():
+        objects = read_objects(folder / names.OBJECTS_CSV)
+    if (folder / names.OBJECTS_GT_CSV).exists():
+        gt_objects = read_object_truth(folder / names.OBJECTS_GT_CSV)
+    return Result(
+        folder, stamps, Ts, gt_stamps, gt_Ts, points, colors, metrics, timings, config,
+        objects, gt_objects,
+    )  # fmt: skip
 
 
 def run_metrics(
@@ -188,6 +228,22 @@ def run_metrics(
         "keyframes": len(static_map.keyframe_indices),
         "map_points": len(static_map),
         "hypotheses": dict(Counter(str(r.hypothesis) for r in results)),
+        "objects": _object_counts(ObjectEstimates.concatenate(*(r.objects for r in results))),
+    }
+
+
+def _object_counts(objects: ObjectEstimates) -> dict[str, Any]:
+    """How many lasting objects there were, of which class, and the rows of each state.
+
+    An object's class is that of its last row: detectors grow surer as an object comes nearer.
+    """
+    last = dict(zip(objects.object_id.tolist(), objects.class_name.tolist(), strict=True))
+    moving = objects.object_id[objects.state == str(ObjectState.MOVING)]
+    return {
+        "tracked": len(last),
+        "moving": len(np.unique(moving)),
+        "by_class": dict(Counter(last.values())),
+        "rows_by_state": dict(Counter(objects.state.tolist())),
     }
 
 
@@ -197,8 +253,8 @@ def _stamped(results: Sequence[FrameResult]) -> tuple[Array, Array]:
     return stamps, Ts.reshape(-1, 4, 4)
 
 
-def _truth_of_run(results: Sequence[FrameResult], truth: GroundTruth) -> tuple[Array, Array]:
-    """Truth from the first to the last processed frame, in the estimate's world.
+def _truth_of_run(results: Sequence[FrameResult], truth: GroundTruth) -> tuple[Array, Array, Array]:
+    """Truth from the first to the last processed frame, in our world, and T_ours_theirs (4, 4).
 
     The world is the first camera, so the first frame that has both poses joins the two frames; it
     is the first of all, unless the truth starts late.
@@ -211,11 +267,11 @@ def _truth_of_run(results: Sequence[FrameResult], truth: GroundTruth) -> tuple[A
         known &= (stamps >= first - 1e-6) & (stamps <= last + 1e-6)
     stamps, Ts = stamps[known], orthonormalise(Ts[known])
     if len(Ts) == 0:
-        return stamps, Ts
+        return stamps, Ts, np.eye(4)
     T_ours_theirs = invert_T(Ts[0])
     for result in results:
         row = np.flatnonzero(np.abs(stamps - result.timestamp_s) < 1e-6)
         if result.status is TrackingStatus.OK and len(row):
             T_ours_theirs = result.T_world_camera @ invert_T(Ts[row[0]])
             break
-    return stamps, T_ours_theirs @ Ts
+    return stamps, T_ours_theirs @ Ts, T_ours_theirs

@@ -20,7 +20,7 @@ from pipelines.io.result import Result, load_result
 from pipelines.runner import run
 from pipelines.types import Frame, FrameResult, TrackingStatus
 
-ESTIMATES = ("camera_tum.txt", "camera_kitti.txt", "static_map.ply")
+ESTIMATES = ("camera_tum.txt", "camera_kitti.txt", "objects.csv", "static_map.ply")
 FILES = {
     *ESTIMATES,
     "config.yaml",
@@ -29,6 +29,7 @@ FILES = {
     "timings.json",
     "run.log",
     "camera_gt_tum.txt",
+    "objects_gt.csv",
 }
 TRUTH = {
     "vdo": ("pose_gt.txt", "object_pose.txt"),
@@ -338,7 +339,10 @@ def test_deleted_truth_changes_no_byte_of_the_estimate(dataset, request, tmp_pat
     assert open_sequence(blind).ground_truth() is None
     assert "camera" in with_truth.metrics
     assert "camera" not in without.metrics
-    assert {p.name for p in without.folder.iterdir()} == FILES - {"camera_gt_tum.txt"}
+    assert {p.name for p in without.folder.iterdir()} == FILES - {
+        "camera_gt_tum.txt",
+        "objects_gt.csv",
+    }
     assert without.metrics["run"]["tracked"] > 5
     assert estimates(with_truth.folder) == estimates(without.folder)
 

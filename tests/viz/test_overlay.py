@@ -70,7 +70,7 @@ def test_masks_take_the_color_of_their_label():
     picture = draw_frame(make_frame(labels=True), make_result())
     color = np.array(style.object_color(3))
     inside = picture[190, 90].astype(float)
-    np.testing.assert_allclose(inside, 90 + 0.42 * (color - 90), atol=1.5)
+    np.testing.assert_allclose(inside, 90 + 0.46 * (color - 90), atol=1.5)
     np.testing.assert_array_equal(picture[190, 40], color)  # contour
     assert (picture[190, 150:] == 90).all()
 

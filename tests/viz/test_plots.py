@@ -5,7 +5,14 @@ import numpy as np
 
 from pipelines.geometry import exp_se3
 from pipelines.io.result import ResultWriter
-from pipelines.types import FrameResult, GroundTruth, MotionHypothesis, TrackingStatus
+from pipelines.object_types import ObjectEstimates
+from pipelines.types import (
+    FrameResult,
+    GroundTruth,
+    MotionHypothesis,
+    ObjectTruth,
+    TrackingStatus,
+)
 from viz import style
 from viz.plots import plot_result
 
@@ -55,3 +62,61 @@ def test_only_what_the_files_allow(tmp_path):
     assert plot_result(tmp_path / "b") == []
     write(tmp_path / "c", 1, truth=True, timings=False)
     assert [path.name for path in plot_result(tmp_path / "c")] == ["trajectory.png"]
+
+
+def write_objects(folder, n: int = 30) -> None:
+    """A car that drives at 36 km/h, and one that is parked and then not seen."""
+    step = exp_se3(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
+    poses = np.array([np.linalg.matrix_power(step, k) for k in range(n)])
+    still = np.tile(np.eye(4), (n, 1, 1))
+    keys = [(k, j) for k in range(n) for j in (1, 2)]
+    states = ["moving" if j == 1 else "stopped" if k < 15 else "coasting" for k, j in keys]
+    M, box = len(keys), np.array([10.0, 10.0, 60.0, 60.0])
+    T = np.array([poses[k] if j == 1 else still[k] for k, j in keys])
+    H = np.array([step if j == 1 else np.eye(4) for _, j in keys])
+    speed = np.array([10.0 if j == 1 else 0.0 for _, j in keys])
+    boxes = np.array([box + 100 * j for _, j in keys])
+    index, ids = np.array([k for k, _ in keys]), np.array([j for _, j in keys])
+    objects = ObjectEstimates(
+        index, 0.1 * index, ids, np.full(M, "car"), np.ones(M), np.array(states), boxes,
+        np.full(M, 50), T, H, np.full((M, 6, 6), np.nan), T[:, :3, 3], speed, np.full(M, 0.3),
+        np.outer(speed, [0, 0, 1]), np.full(M, 0.2), np.ones((M, 3)),
+    )  # fmt: skip
+    truth = ObjectTruth(index, ids, np.full(M, "car"), T, boxes, ids == 1)
+    results = [
+        FrameResult(
+            k, 0.1 * k, TrackingStatus.OK, np.eye(4), np.eye(6), MotionHypothesis.NONE, False,
+            np.empty((0, 2)), np.empty(0, np.int64), np.empty(0, bool), 0.0,
+            objects[objects.frame_index == k], timings_ms={"total": 12.0},
+        )
+        for k in range(n)
+    ]  # fmt: skip
+    writer = ResultWriter(folder)
+    writer.write_camera(results)
+    writer.write_timings(results)
+    writer.write_objects(results)
+    writer.write_ground_truth(results, GroundTruth(0.1 * np.arange(n), still, truth))
+
+
+def test_objects_have_their_diagrams(tmp_path):
+    write_objects(tmp_path)
+    names = [path.name for path in plot_result(tmp_path)]
+    assert names[-2:] == ["objects_speed.png", "objects_timeline.png"]
+    speeds, lives = (
+        cv2.imread(str(tmp_path / "plots" / name))[..., ::-1].astype(int) for name in names[-2:]
+    )
+    moving, parked = style.object_color(1), style.object_color(2)
+    assert (np.abs(speeds - moving).sum(2) < 40).sum() > 100
+    assert (np.abs(speeds - parked).sum(2) < 40).sum() == 0  # it never moved
+    full = (np.abs(lives - moving).sum(2) < 20).sum()
+    thin = (np.abs(lives - parked).sum(2) < 20).sum()
+    assert full > 3 * thin > 300  # predicted only: a thin line
+    shade = 255 - 0.42 * (255 - np.array(parked))
+    assert (np.abs(lives - shade).sum(2) < 12).sum() > 2 * thin
+
+
+def test_stopped_objects_alone_have_no_speeds_to_show(tmp_path):
+    write_objects(tmp_path, 4)  # too short to be called moving
+    names = [path.name for path in plot_result(tmp_path)]
+    assert "objects_speed.png" not in names
+    assert "objects_timeline.png" in names

@@ -110,6 +110,7 @@ class SimulatedSequence(Sequence):
         self._exact = self._folder(base, "exact", {}, self._render_left)
         self.root = self._exact
         self._right: Path | None = None
+        self._counts: NDArray[np.int64] | None = None
         self._worn: Path | None = None
         if "right" in self._provide:
             self._right = self._folder(base, "right", {"right": True}, self._render_right)
@@ -178,8 +179,19 @@ class SimulatedSequence(Sequence):
             truth["Ts_world_object"][frame, row],
             truth["boxes_px"][frame, row],
             truth["moving"][row],
+            self._pixel_counts(truth["object_id"])[frame, row],
         )
         return GroundTruth(self.timestamps_s.copy(), truth["Ts_world_camera"][:N], objects)
+
+    def _pixel_counts(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(N, A) pixels that each object is seen in; counted once, when the truth is asked for."""
+        if self._counts is None:
+            counts = np.zeros((self._frames, max(ids, default=0) + 1), np.int64)
+            for index in range(self._frames):
+                labels = self._left(index)["labels"].ravel()
+                counts[index] = np.bincount(labels, minlength=counts.shape[1])[: counts.shape[1]]
+            self._counts = counts[:, ids]
+        return self._counts
 
     def _folder(
         self, base: Path, kind: str, extra: dict[str, Any], make: Callable[[Path], None]

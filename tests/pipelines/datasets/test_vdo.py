@@ -163,6 +163,8 @@ def test_exact_objects_go_before_text(write_tree: Write) -> None:
     np.testing.assert_allclose(objects.Ts_world_object[objects.object_id == 1][:, 0, 3], range(4))
     assert (objects.moving == (objects.object_id == 1)).all()
     np.testing.assert_allclose(objects.boxes_px[objects.object_id == 1][3], [23, 10, 34, 19])
+    assert objects.n_pixels[objects.object_id == 1].tolist() == [120] * 4  # of the masks, 12 x 10
+    assert not objects.n_pixels[objects.object_id == 7].any()
     assert np.isnan(objects.boxes_px[objects.object_id == 7]).all()  # out of sight
 
 
@@ -174,6 +176,18 @@ def test_objects_in_the_world_take_boxes_from_masks(write_tree: Write) -> None:
     np.testing.assert_allclose(objects.Ts_world_object[3, :3, 3], [1.5, -1.0, 2.0])
     np.testing.assert_allclose(objects.Ts_world_object[3, :3, 0], [0, 0, -1], atol=1e-9)
     np.testing.assert_allclose(objects.boxes_px[3], [23, 10, 34, 19])
+
+
+def test_masks_that_cannot_be_read_cost_only_their_frames_pixels(write_tree: Write) -> None:
+    root = write_tree("vdo")
+    masks = sorted((root / "semantic").iterdir())
+    masks[1].write_bytes(b"damaged")
+    objects = objects_of(VdoSequence.open(root))
+    assert objects.n_pixels[objects.object_id == 1].tolist() == [120, 0, 120, 120]
+    np.testing.assert_allclose(objects.boxes_px[objects.object_id == 1][2], [22, 10, 33, 19])
+    for path in masks:
+        path.unlink()
+    assert objects_of(VdoSequence.open(root)).n_pixels is None
 
 
 def test_truth_is_found_by_frame_number(write_tree: Write) -> None:

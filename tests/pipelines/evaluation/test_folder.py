@@ -1,6 +1,7 @@
 """Evaluation of result folders, from their files alone."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from pipelines.errors import FormatError
 from pipelines.evaluation import evaluate_result, metrics_text
 from pipelines.evaluation.table import STATISTICS
-from pipelines.geometry import exp_se3
+from pipelines.geometry import exp_se3, invert_T
 from pipelines.io.result import ResultWriter, run_metrics
 from pipelines.types import (
     FrameResult,
@@ -131,3 +132,77 @@ def test_values_stand_under_their_headings():
         assert ate[: heading.index(words) + len(words)].endswith(value)
     assert ratio[: heading.index("RMSE") + 4].endswith("1.0100")
     assert len(ate) < 80
+
+
+def write_objects_run(folder, world, index, noise=lambda objects: objects) -> None:
+    """A run over the frames `index` of the small world, with its truth, as files."""
+    estimates = noise(world.estimates(index))
+    frames = [
+        FrameResult(
+            frame_index=int(k),
+            timestamp_s=float(world.stamps[k]),
+            status=TrackingStatus.OK,
+            T_world_camera=invert_T(world.cameras[index[0]]) @ world.cameras[k],
+            pose_covariance=np.eye(6),
+            hypothesis=MotionHypothesis.CONSTANT_VELOCITY,
+            is_keyframe=False,
+            keypoints_px=np.empty((0, 2)),
+            point_ids=np.empty(0, np.int64),
+            inliers=np.empty(0, bool),
+            reprojection_rmse_px=0.0,
+            objects=estimates[estimates.frame_index == k],
+            timings_ms={"total": 20.0},
+        )
+        for k in index.tolist()
+    ]
+    gt = GroundTruth(world.stamps, world.cameras, world.truth())
+    write(folder, frames, gt)
+
+
+@pytest.mark.parametrize("index", [np.arange(30), np.arange(0, 30, 2)], ids=["all", "stride 2"])
+def test_objects_are_evaluated_from_files_alone(tmp_path, world, index):
+    write_objects_run(tmp_path, world, index)
+    found = evaluate_result(tmp_path)["objects"]
+    assert found["object_frames"] == 2 * (len(index) - 1)
+    assert found["motion"]["trans_max_m"] < 1e-7  # what the digits of the files leave
+    assert found["coverage"]["share"] == found["tracking"]["mota"] == 1.0
+    (tmp_path / "timings.json").unlink()  # the frames are then those of objects.csv
+    again = evaluate_result(tmp_path)["objects"]
+    assert again["object_frames"] == found["object_frames"]
+    assert again["motion"]["trans_max_m"] < 1e-7
+    assert again["coverage"] == found["coverage"]
+    (tmp_path / "objects_gt.csv").unlink()
+    assert "objects" not in evaluate_result(tmp_path)
+
+
+def test_a_run_that_starts_later_has_another_world(tmp_path, world):
+    """Its world is its first camera; estimates in the old world would be far off."""
+    index = np.arange(5, 30)
+    T = invert_T(world.cameras[5])
+
+    def moved(objects):
+        return replace(
+            objects,
+            Hs_world_curr_prev=T @ objects.Hs_world_curr_prev @ invert_T(T),
+            Ts_world_object=T @ objects.Ts_world_object,
+        )
+
+    write_objects_run(tmp_path, world, index, moved)
+    found = evaluate_result(tmp_path)["objects"]
+    assert found["motion"]["trans_max_m"] < 1e-7
+    assert found["pose"]["trans_max_m"] < 1e-7
+
+
+def test_the_table_shows_objects(tmp_path, world):
+    write_objects_run(tmp_path, world, np.arange(30))
+    metrics = evaluate_result(tmp_path)
+    text = (tmp_path / "metrics.txt").read_text()
+    assert "Objects     3 tracked (3 car), 2 of them seen moving" in text
+    for label in ("Motion, translation", "Motion, rotation", "Speed  ", "Pose, translation"):
+        row = next(line for line in text.splitlines() if line.startswith(label))
+        assert len(row.split()) >= 6
+    coverage = metrics["objects"]["coverage"]
+    assert f"Coverage      100.0 % ({coverage['found']} of {coverage['truth']} with > 3" in text
+    assert "MOTA 1.000, IDF1 1.000, 0 ID switches" in text
+    of_objects = text[text.index("Object errors") : text.index("Time a frame")]
+    assert [line for line in of_objects.splitlines() if len(line) >= 80] == []

@@ -187,3 +187,12 @@ def test_static_scene_has_no_motion(cache):
     still = SimulatedSequence("static", frames=2, scale=0.2, cache=cache)
     assert not still.ground_truth().objects.moving.any()
     assert (still.read(1).instance_labels > 0).mean() > 0.01
+
+
+def test_boxes_and_pixel_counts_are_those_of_the_masks(exact):
+    truth, labels = exact.ground_truth().objects, exact.read(2).instance_labels
+    rows = np.flatnonzero(truth.frame_index == 2)
+    seen = [int((labels == j).sum()) for j in truth.object_id[rows]]
+    assert max(seen) > 100
+    assert truth.n_pixels[rows].tolist() == seen
+    np.testing.assert_array_equal(np.isfinite(truth.boxes_px[rows, 0]), np.array(seen) > 0)
