@@ -19,6 +19,7 @@ DATASETS = {
     "simulated": "pipelines.datasets.simulated.sequence:SimulatedSequence",
     "vdo": "pipelines.datasets.vdo:VdoSequence",
     "kitti_odometry": "pipelines.datasets.kitti_odometry:KittiOdometrySequence",
+    "kitti_tracking": "pipelines.datasets.kitti_tracking:KittiTrackingSequence",
     "tum_rgbd": "pipelines.datasets.tum_rgbd:TumRgbdSequence",
     "folder": "pipelines.datasets.folder:FolderSequence",
 }
@@ -47,10 +48,14 @@ def open_sequence(
     """The sequence in a folder.
 
     dataset: a name of the table; guessed from the folder where None. name: a sequence inside a
-    folder of several, as a sub-folder of `path` or of `path`/sequences. options: of that data set.
-    Raises DatasetError that says what trees are expected and what was found.
+    folder of several, as a sub-folder of `path` or of `path`/sequences, or as the layout names it.
+    options: of that data set. Raises DatasetError that says what trees are expected and what was
+    found.
     """
     if name is not None:
+        holder = _holder_of_sequences(Path(path), dataset)
+        if holder is not None:
+            return holder.open(path, sequence=name, **options)
         path = _inner_folder(Path(path), name)
     return load_dataset(dataset or _guess(path)).open(path, **options)
 
@@ -111,6 +116,12 @@ def _hint_inside(folder: Path) -> str:
         if len(found) == 1:
             return f"its sub-folder {inner.name} looks like {found[0]}: give {inner}"
     return ""
+
+
+def _holder_of_sequences(path: Path, dataset: str | None) -> Any:
+    """The class of a layout that keeps several sequences in common sub-folders; None for others."""
+    classes = (load_dataset(name) for name in ([dataset] if dataset else DATASETS))
+    return next((found for found in classes if found.inside(path)), None)
 
 
 def _inner_folder(root: Path, name: str) -> Path:

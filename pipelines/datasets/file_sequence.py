@@ -14,6 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipelines.datasets.files import (
     DamagedFileError,
     DepthCoding,
@@ -23,6 +26,7 @@ from pipelines.datasets.files import (
     read_image,
     read_labels,
 )
+from pipelines.datasets.mask_classes import read_mask_classes
 from pipelines.datasets.sequence import Sequence
 from pipelines.datasets.tree import describe_folder
 from pipelines.errors import DatasetError, FrameError
@@ -38,6 +42,7 @@ class FrameFiles:
 
     A path that does not exist is an input missing from this frame alone.
     flow_prev_to_curr: lies on the grid of the previous frame and points into this one.
+    classes: json that names the instances of `labels`, see `mask_classes`.
     """
 
     image: Path
@@ -45,6 +50,7 @@ class FrameFiles:
     depth: Path | None = None
     flow_prev_to_curr: Path | None = None
     labels: Path | None = None
+    classes: Path | None = None
 
 
 class FileSequence(Sequence):
@@ -83,14 +89,7 @@ class FileSequence(Sequence):
     @classmethod
     def open(cls, path: Path | str, **options: Any) -> Self:
         """The sequence in `path`; raises DatasetError where something essential is missing."""
-        known = [name for name in inspect.signature(cls._open).parameters if name != "root"]
-        for name in options:
-            if name not in known:
-                nearest = difflib.get_close_matches(name, known, 1)
-                raise DatasetError(
-                    f"Data set {cls.dataset}: unknown option {name!r}, "
-                    + (f"did you mean {nearest[0]!r}?" if nearest else f"known: {', '.join(known)}")
-                )
+        check_options(cls.dataset, cls._open, options)
         root = Path(path)
         if not root.is_dir():
             raise DatasetError(
@@ -120,6 +119,7 @@ class FileSequence(Sequence):
                 f"{files.image_right}: expected the same channels as the left image "
                 f"{image.shape}, found {right.shape}; convert one of them."
             )
+        labels = self._read_optional(index, "mask", files.labels, size, read_labels)
         return Frame(
             index=index,
             timestamp_s=float(self.timestamps_s[index]),
@@ -127,10 +127,30 @@ class FileSequence(Sequence):
             image_right=right,
             depth_m=self._read_optional(index, "depth", files.depth, size, self._decode_depth),
             flow_prev_to_curr_px=self._read_optional(
-                index, "flow", files.flow_prev_to_curr, size, read_flow
+                index, "flow", files.flow_prev_to_curr, size, self._decode_flow
             ),
-            instance_labels=self._read_optional(index, "mask", files.labels, size, read_labels),
+            instance_labels=labels,
+            instance_classes=None if labels is None else self._read_classes(index, labels),
         )
+
+    def files(self, index: int) -> FrameFiles:
+        """The files of frame `index`, for those who copy or link them."""
+        return self._frames[index]
+
+    @property
+    def depth_coding(self) -> DepthCoding | None:
+        """How the depth images are read; None where there are none."""
+        return self._depth_coding
+
+    def _read_classes(self, index: int, labels: NDArray[np.int32]) -> dict[int, str] | None:
+        """Class names of the instances in `labels`, None where the sequence does not say."""
+        path, size = self._frames[index].classes, (self.camera.width, self.camera.height)
+        if path is None or not path.exists():
+            return None  # most masks come without, and no frame is the worse for it
+        return self._read_optional(index, "classes", path, size, lambda p, _: read_mask_classes(p))
+
+    def _decode_flow(self, path: Path, size: Size) -> NDArray[np.float32]:
+        return read_flow(path, size)
 
     def _decode_depth(self, path: Path, size: Size) -> Any:
         if self._depth_coding is None:
@@ -155,6 +175,18 @@ class FileSequence(Sequence):
         except DamagedFileError as error:
             log.warning("frame %d goes without %s: %s", index, what, error)
             return None
+
+
+def check_options(dataset: str, opener: Callable[..., Any], options: dict[str, Any]) -> None:
+    """Raise DatasetError, naming the nearest, for an option that `opener` does not take."""
+    known = [name for name in inspect.signature(opener).parameters if name != "root"]
+    for name in options:
+        if name not in known:
+            nearest = difflib.get_close_matches(name, known, 1)
+            raise DatasetError(
+                f"Data set {dataset}: unknown option {name!r}, "
+                + (f"did you mean {nearest[0]!r}?" if nearest else f"known: {', '.join(known)}")
+            )
 
 
 def common_image_size(images: list[Path], settings_size: Size | None, source: str) -> Size:

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.datasets.palette import indices_as_grey, is_palette_png
 from pipelines.errors import DatasetError, FrameError
 from pipelines.types import Image
 
@@ -137,13 +138,16 @@ def read_flow(path: Path, size: Size | None = None) -> NDArray[np.float32]:
 
 
 def read_labels(path: Path, size: Size) -> NDArray[np.int32]:
-    """Instance labels (H, W) int32, 0 background, from .txt, .png or .npy. Raises FrameError."""
+    """Instance labels (H, W) int32, 0 background, from .txt, .png or .npy. Raises FrameError.
+
+    Of a PNG with a palette the indices are the labels.
+    """
     if path.suffix == ".txt":
         labels = _read_label_text(path, size)
     elif path.suffix == ".npy":
         labels = _load_array(path, "a label array")
     else:
-        labels = _decode(path, "a label image")
+        labels = _decode(path, "a label image", indices=True)
     if labels.ndim != 2 or not np.issubdtype(labels.dtype, np.integer):
         raise FrameError(
             f"Labels {path}: expected one integer per pixel, found {labels.shape} {labels.dtype}."
@@ -164,8 +168,11 @@ def _read_bytes(path: Path, what: str) -> bytes:
     return content
 
 
-def _decode(path: Path, what: str) -> NDArray:
-    content = np.frombuffer(_read_bytes(path, what), np.uint8)
+def _decode(path: Path, what: str, indices: bool = False) -> NDArray:
+    read = _read_bytes(path, what)
+    if indices and is_palette_png(read):
+        read = indices_as_grey(read)
+    content = np.frombuffer(read, np.uint8)
     try:
         pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
     except cv2.error:

@@ -105,6 +105,36 @@ def write_kitti_odometry(root: Path) -> Path:
     return root
 
 
+def write_kitti_tracking(root: Path) -> Path:
+    """One sequence, 0003, whose frames drive east by oxts; the car gains on the camera."""
+    for k in range(N):
+        write_image(root / f"image_02/0003/{k:06d}.png", k)
+        write_image(root / f"image_03/0003/{k:06d}.png", 100 + k)
+    row = f"{FX} 0 {CX} {{}} 0 {FY} {CY} 0 0 0 1 0"
+    shifts = (0.0, -BF, 3.0, 3.0 - BF)
+    lines = [f"P{i}: {row.format(x)}" for i, x in enumerate(shifts)]
+    # x of the inertial unit and the laser scanner is ahead, y to the left, z up.
+    lines += ["R_rect 1 0 0 0 1 0 0 0 1", "Tr_velo_cam 0 -1 0 0 0 0 -1 0 1 0 0 0"]
+    lines += ["Tr_imu_velo 1 0 0 -0.8 0 1 0 0.3 0 0 1 -0.8"]
+    for folder in ("calib", "label_02", "oxts"):
+        (root / folder).mkdir()
+    (root / "calib/0003.txt").write_text("\n".join(lines) + "\n")
+    labels, oxts = [], np.zeros((N, 30))
+    size = "1.4 1.7 4.0"  # height, width, length
+    for k in range(N):
+        labels.append(f"{k} -1 DontCare -1 -1 -10 1 1 4 4 -1 -1 -1 -1000 -1000 -1000 -10")
+        ahead_m = 10.0 + (OBJECT_STEP_M - STEP_M) * k
+        box = f"{20 + k} 10 {31 + k} 19"
+        labels.append(f"{k} 1 Car 0 0 0 {box} {size} 1.0 1.5 {ahead_m:.6f} {-np.pi / 2:.12f}")
+        still_m = 9.0 - STEP_M * k
+        labels.append(f"{k} 12 Pedestrian 0 0 0 5 30 8 35 1.8 0.5 0.5 -2 1.5 {still_m:.6f} 0.3")
+    metres_a_degree = np.radians(1.0) * 6378137.0 * np.cos(np.radians(49.0))
+    oxts[:, 0], oxts[:, 1] = 49.0, 8.4 + STEP_M * np.arange(N) / metres_a_degree
+    (root / "label_02/0003.txt").write_text("\n".join(labels) + "\n")
+    np.savetxt(root / "oxts/0003.txt", oxts, fmt="%.14f")
+    return root
+
+
 def write_tum_rgbd(root: Path) -> Path:
     """Lists in TUM's form; one colour image has no depth within 0.02 s and drops out."""
     colours, depths, poses = [], [], []
@@ -147,6 +177,7 @@ def write_folder(root: Path) -> Path:
 WRITERS = {
     "vdo": write_vdo,
     "kitti_odometry": write_kitti_odometry,
+    "kitti_tracking": write_kitti_tracking,
     "tum_rgbd": write_tum_rgbd,
     "folder": write_folder,
 }
