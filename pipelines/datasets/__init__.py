@@ -20,6 +20,8 @@ DATASETS = {
     "vdo": "pipelines.datasets.vdo:VdoSequence",
     "kitti_odometry": "pipelines.datasets.kitti_odometry:KittiOdometrySequence",
     "kitti_tracking": "pipelines.datasets.kitti_tracking:KittiTrackingSequence",
+    "virtual_kitti2": "pipelines.datasets.virtual_kitti2:VirtualKitti2Sequence",
+    "omd": "pipelines.datasets.omd:OmdSequence",
     "tum_rgbd": "pipelines.datasets.tum_rgbd:TumRgbdSequence",
     "folder": "pipelines.datasets.folder:FolderSequence",
 }

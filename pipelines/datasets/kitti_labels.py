@@ -1,6 +1,6 @@
 """Object truth of KITTI tracking: the rows of label_02, in the world of the ego poses.
 
-Owns these rows and the classes' names. Truth: the estimator never calls this module.
+Owns these rows. Truth: the estimator never calls this module.
 """
 
 from __future__ import annotations
@@ -10,23 +10,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pipelines.datasets.kitti_classes import class_of_kitti
 from pipelines.datasets.truth import ever_moves
 from pipelines.errors import DatasetError
-from pipelines.object_types import UNNAMED_CLASS
 from pipelines.types import Array, ObjectTruth
 
-# KITTI's types by the COCO name that a detector would give; others keep their lower-case name.
-CLASSES = {
-    "Car": "car",
-    "Van": "car",
-    "Truck": "truck",
-    "Pedestrian": "person",
-    "Person": "person",
-    "Person_sitting": "person",
-    "Cyclist": "bicycle",  # the box holds rider and bicycle
-    "Tram": "train",
-    "Misc": UNNAMED_CLASS,
-}
 NO_OBJECT = "DontCare"  # regions that nobody labelled
 N_COLUMNS = 17  # frame track type truncated occluded alpha x1 y1 x2 y2 h w l x y z ry
 
@@ -72,7 +60,7 @@ def read_kitti_objects(
     rows, frame_index = rows[known], frame_index[known]
     object_id = rows[:, 1].astype(np.int64)
     Ts = Ts_world_camera0[frame_index] @ Ts_camera0_object(rows)
-    names = [CLASSES.get(kind, kind.lower()) for kind, row in zip(types, known, strict=True) if row]
+    names = [class_of_kitti(kind) for kind, row in zip(types, known, strict=True) if row]
     return ObjectTruth(
         frame_index=frame_index,
         object_id=object_id,
