@@ -24,10 +24,11 @@ DATASETS = {
     "omd": "pipelines.datasets.omd:OmdSequence",
     "tum_rgbd": "pipelines.datasets.tum_rgbd:TumRgbdSequence",
     "folder": "pipelines.datasets.folder:FolderSequence",
+    "video": "pipelines.datasets.video:VideoSequence",
 }
 
 
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".bag")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 _ASK_DATASETS = (
     "see which files each layout wants with 'python3 -m app datasets', or name one with --dataset "
     "to hear what it lacks"
@@ -47,7 +48,7 @@ def load_dataset(dataset: str) -> Any:
 def open_sequence(
     path: Path | str, dataset: str | None = None, name: str | None = None, **options: Any
 ) -> Sequence:
-    """The sequence in a folder.
+    """The sequence in a folder or a video file.
 
     dataset: a name of the table; guessed from the folder where None. name: a sequence inside a
     folder of several, as a sub-folder of `path` or of `path`/sequences, or as the layout names it.
@@ -88,8 +89,13 @@ def _guess(path: Path | str) -> str:
 
 def _no_folder(path: Path) -> str:
     if path.is_file():
-        video = " of images, since videos are not read" if path.suffix.lower() in VIDEOS else ""
-        return f"{path}: expected a folder{video}, found a file; give the folder of a sequence"
+        hint = ""
+        if path.suffix.lower() == ".bag":
+            hint = " of images exported from it, since bags are not read"
+        return (
+            f"{path}: expected a folder{hint} or a video ({', '.join(VIDEOS)}), found another "
+            "file; give the folder of a sequence"
+        )
     inner = [p.name for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
     nearest = difflib.get_close_matches(path.name, inner, 1, 0.75)
     advice = f"did you mean {path.parent / nearest[0]}?" if nearest else "correct the path"
@@ -100,8 +106,8 @@ def _hint_at_video(folder: Path) -> str:
     if not any(p.suffix.lower() in VIDEOS for p in folder.iterdir()):
         return ""
     return (
-        "videos are not read, and one camera alone has no scale: give images with depth or right "
-        "images beside them, as 'python3 -m app datasets folder' says"
+        "a video needs a camera.yaml beside it, and a second camera or depth, as "
+        "'python3 -m app datasets video' says"
     )
 
 

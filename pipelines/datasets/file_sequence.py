@@ -113,20 +113,20 @@ class FileSequence(Sequence):
             raise IndexError(f"frame {index} of {self.name}, which has {len(self)}")
         files, size = self._frames[index], (self.camera.width, self.camera.height)
         image = read_image(files.image, size)
-        right = self._read_optional(index, "right image", files.image_right, size, read_image)
+        right = read_optional(index, "right image", files.image_right, size, read_image)
         if right is not None and right.shape != image.shape:
             raise FrameError(
                 f"{files.image_right}: expected the same channels as the left image "
                 f"{image.shape}, found {right.shape}; convert one of them."
             )
-        labels = self._read_optional(index, "mask", files.labels, size, read_labels)
+        labels = read_optional(index, "mask", files.labels, size, read_labels)
         return Frame(
             index=index,
             timestamp_s=float(self.timestamps_s[index]),
             image=image,
             image_right=right,
-            depth_m=self._read_optional(index, "depth", files.depth, size, self._decode_depth),
-            flow_prev_to_curr_px=self._read_optional(
+            depth_m=read_optional(index, "depth", files.depth, size, self._decode_depth),
+            flow_prev_to_curr_px=read_optional(
                 index, "flow", files.flow_prev_to_curr, size, self._decode_flow
             ),
             instance_labels=labels,
@@ -147,7 +147,7 @@ class FileSequence(Sequence):
         path, size = self._frames[index].classes, (self.camera.width, self.camera.height)
         if path is None or not path.exists():
             return None  # most masks come without, and no frame is the worse for it
-        return self._read_optional(index, "classes", path, size, lambda p, _: read_mask_classes(p))
+        return read_optional(index, "classes", path, size, lambda p, _: read_mask_classes(p))
 
     def _decode_flow(self, path: Path, size: Size) -> NDArray[np.float32]:
         return read_flow(path, size)
@@ -157,24 +157,24 @@ class FileSequence(Sequence):
             raise DatasetError(f"{path}: depth without a scale; set depth_scale.")
         return read_depth(path, self._depth_coding, size)
 
-    def _read_optional(
-        self,
-        index: int,
-        what: str,
-        path: Path | None,
-        size: Size,
-        read: Callable[[Path, Size], Read],
-    ) -> Read | None:
-        if path is None:
-            return None
-        if not path.exists():
-            log.warning("frame %d has no %s: %s is missing", index, what, path)
-            return None
-        try:
-            return read(path, size)
-        except DamagedFileError as error:
-            log.warning("frame %d goes without %s: %s", index, what, error)
-            return None
+
+def read_optional(
+    index: int, what: str, path: Path | None, size: Size, read: Callable[[Path, Size], Read]
+) -> Read | None:
+    """What `read` makes of `path`; None, with a warning, where that is missing or damaged.
+
+    None as well, without one, where `path` is None. A file of a wrong size or form is FrameError.
+    """
+    if path is None:
+        return None
+    if not path.exists():
+        log.warning("frame %d has no %s: %s is missing", index, what, path)
+        return None
+    try:
+        return read(path, size)
+    except DamagedFileError as error:
+        log.warning("frame %d goes without %s: %s", index, what, error)
+        return None
 
 
 def check_options(dataset: str, opener: Callable[..., Any], options: dict[str, Any]) -> None:

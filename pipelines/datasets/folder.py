@@ -12,6 +12,7 @@ from pipelines.datasets.calibration import (
     CAMERA_YAML,
     RGBD_BF,
     bf_of,
+    depth_coding_of,
     make_camera,
     number,
     read_camera_yaml,
@@ -19,7 +20,6 @@ from pipelines.datasets.calibration import (
     settings_size,
 )
 from pipelines.datasets.file_sequence import FileSequence, FrameFiles, common_image_size
-from pipelines.datasets.files import DepthCoding
 from pipelines.datasets.timestamps import frame_times
 from pipelines.datasets.tree import first_folder, list_files, tree_error
 from pipelines.datasets.truth import read_tum_poses
@@ -83,8 +83,7 @@ class FolderSequence(FileSequence):
         camera = make_camera(size, fx, fy, cx, cy, bf or RGBD_BF, yaml, is_rgbd)
         fps = fps or number(settings, "fps", yaml)
         times_s = frame_times(root / "times.txt", fps, len(images), root)
-        scale = depth_scale or number(settings, "depth_scale", yaml)
-        coding = _coding(depths, scale, settings.get("depth_form", "metric"), camera.bf, yaml)
+        coding = depth_coding_of(depths.values(), settings, camera.bf, yaml, depth_scale)
         return cls(root, camera, times_s, _frame_files(root, images, depths, rights), coding)
 
     def ground_truth(self) -> GroundTruth | None:
@@ -92,21 +91,6 @@ class FolderSequence(FileSequence):
         if not path.is_file():
             return None
         return GroundTruth(self.timestamps_s, read_tum_poses(path, self.timestamps_s))
-
-
-def _coding(
-    depths: dict[str, Path], scale: float | None, form: str, bf: float, yaml: Path
-) -> DepthCoding | None:
-    if not depths:
-        return None
-    if scale is None:
-        if any(path.suffix.lower() == ".png" for path in depths.values()):
-            raise DatasetError(
-                f"{yaml}: missing calibration, expected depth_scale, the value of 1 m in the depth "
-                "images (1000 for millimetres), found none; add it."
-            )
-        scale = 1.0
-    return DepthCoding(form, scale, bf)  # type: ignore[arg-type]  # checks the form itself
 
 
 def _frame_files(
