@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines import prepare as module
+from pipelines import prepare_steps
 from pipelines.config import load_config
 from pipelines.datasets import open_sequence
 from pipelines.depth import StereoDepth, to_gray
@@ -269,7 +269,9 @@ def test_wishes_that_cannot_be_met(stereo_folder: Path) -> None:
 def test_the_detector_of_the_settings_is_asked_for_once(stereo_folder: Path, monkeypatch) -> None:
     asked, detector = [], Detector()
     monkeypatch.setattr(
-        module, "_load_detector", lambda config, given: (asked.append(given), (detector, "fake"))[1]
+        prepare_steps,
+        "_load_detector",
+        lambda config, given: (asked.append(given), (detector, "fake"))[1],
     )
     every_third = replace(FAST, detector=replace(FAST.detector, every_n=3))
     prepare(open_sequence(stereo_folder), every_third, what=["masks"])
