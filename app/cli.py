@@ -58,6 +58,14 @@ eval RESULT""",
 render                          # the latest result
 render RESULT --size 1920x1080 --views top""",
     ),
+    "prepare": Verb(
+        "app.preparation:prepare",
+        "write depth, flow and masks of a sequence, so that later runs reuse them",
+        """\
+prepare DATA                    # what is there is kept; after a stop it goes on
+prepare DATA --what depth,flow --frames 100
+prepare DATA --set flow.preset=fast --output my_folder --overwrite""",
+    ),
     "doctor": Verb(
         "app.doctor:doctor",
         "say whether this machine, or a data folder, is fit",
@@ -158,6 +166,7 @@ def build_parser() -> argparse.ArgumentParser:
         "run": _add_run,
         "eval": _add_result,
         "render": _add_render,
+        "prepare": _add_prepare,
         "doctor": _add_doctor,
         "config": _add_settings,
         "datasets": _add_datasets,
@@ -248,6 +257,29 @@ VIEWS = ("top", "perspective")
 SIZES_PX = (160, 8192)  # smaller pictures hold no text; larger ones no renderer makes
 
 
+KINDS = ("depth", "flow", "masks")  # of files that prepare makes
+
+
+def _add_prepare(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("path", metavar="PATH", help="data folder or video")
+    parser.add_argument("--dataset", metavar="NAME", help="layout, where the guess is wrong")
+    parser.add_argument("--sequence", metavar="NAME", help="which sequence, where PATH holds many")
+    parser.add_argument(
+        "--output",
+        metavar="DIR",
+        help="folder to fill (default: PATH itself where it is a `folder`, else prepared/NAME)",
+    )
+    parser.add_argument(
+        "--what", type=_kinds, default=KINDS, metavar="KINDS", help=f"default: {','.join(KINDS)}"
+    )
+    parser.add_argument("--frames", type=_positive, metavar="N", help="the first N frames alone")
+    parser.add_argument(
+        "--overwrite", action="store_true", help="make anew what prepare has made before"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress bar and no table")
+    _add_settings(parser)
+
+
 def _add_doctor(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", metavar="PATH", nargs="?", help="a data folder to look at")
     parser.add_argument("--dataset", metavar="NAME", help="layout, where the guess is wrong")
@@ -296,6 +328,14 @@ def _not_negative(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"expected a whole number, found '{text}'")
     return int(text)
+
+
+def _kinds(text: str) -> tuple[str, ...]:
+    kinds = tuple(word.strip() for word in text.split(","))
+    unknown = [kind for kind in kinds if kind not in KINDS]
+    if unknown:
+        raise argparse.ArgumentTypeError(f"expected some of {','.join(KINDS)}, found '{text}'")
+    return kinds
 
 
 def _size(text: str) -> tuple[int, int]:

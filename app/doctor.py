@@ -232,7 +232,9 @@ def _frame(frame: Any) -> Finding:
     if frame.flow_prev_to_curr_px is not None:
         parts.append("flow")
     if frame.instance_labels is not None:
-        parts.append(f"masks of {len(np.unique(frame.instance_labels[frame.instance_labels > 0]))}")
+        n = len(np.unique(frame.instance_labels[frame.instance_labels > 0]))
+        classes = ", ".join(sorted(set((frame.instance_classes or {}).values())))
+        parts.append(f"masks of {n}" + (f" ({classes})" if classes else ""))
     subject = f"frame {frame.index}"
     if frame.image_right is None and share == 0.0:
         words = f"{', '.join(parts)}: neither depth nor a right image, and one of them is needed"

@@ -19,12 +19,16 @@ DATASETS = {
     "simulated": "pipelines.datasets.simulated.sequence:SimulatedSequence",
     "vdo": "pipelines.datasets.vdo:VdoSequence",
     "kitti_odometry": "pipelines.datasets.kitti_odometry:KittiOdometrySequence",
+    "kitti_tracking": "pipelines.datasets.kitti_tracking:KittiTrackingSequence",
+    "virtual_kitti2": "pipelines.datasets.virtual_kitti2:VirtualKitti2Sequence",
+    "omd": "pipelines.datasets.omd:OmdSequence",
     "tum_rgbd": "pipelines.datasets.tum_rgbd:TumRgbdSequence",
     "folder": "pipelines.datasets.folder:FolderSequence",
+    "video": "pipelines.datasets.video:VideoSequence",
 }
 
 
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".bag")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 _ASK_DATASETS = (
     "see which files each layout wants with 'python3 -m app datasets', or name one with --dataset "
     "to hear what it lacks"
@@ -44,13 +48,17 @@ def load_dataset(dataset: str) -> Any:
 def open_sequence(
     path: Path | str, dataset: str | None = None, name: str | None = None, **options: Any
 ) -> Sequence:
-    """The sequence in a folder.
+    """The sequence in a folder or a video file.
 
     dataset: a name of the table; guessed from the folder where None. name: a sequence inside a
-    folder of several, as a sub-folder of `path` or of `path`/sequences. options: of that data set.
-    Raises DatasetError that says what trees are expected and what was found.
+    folder of several, as a sub-folder of `path` or of `path`/sequences, or as the layout names it.
+    options: of that data set. Raises DatasetError that says what trees are expected and what was
+    found.
     """
     if name is not None:
+        holder = _holder_of_sequences(Path(path), dataset)
+        if holder is not None:
+            return holder.open(path, sequence=name, **options)
         path = _inner_folder(Path(path), name)
     return load_dataset(dataset or _guess(path)).open(path, **options)
 
@@ -81,8 +89,13 @@ def _guess(path: Path | str) -> str:
 
 def _no_folder(path: Path) -> str:
     if path.is_file():
-        video = " of images, since videos are not read" if path.suffix.lower() in VIDEOS else ""
-        return f"{path}: expected a folder{video}, found a file; give the folder of a sequence"
+        hint = ""
+        if path.suffix.lower() == ".bag":
+            hint = " of images exported from it, since bags are not read"
+        return (
+            f"{path}: expected a folder{hint} or a video ({', '.join(VIDEOS)}), found another "
+            "file; give the folder of a sequence"
+        )
     inner = [p.name for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
     nearest = difflib.get_close_matches(path.name, inner, 1, 0.75)
     advice = f"did you mean {path.parent / nearest[0]}?" if nearest else "correct the path"
@@ -93,8 +106,8 @@ def _hint_at_video(folder: Path) -> str:
     if not any(p.suffix.lower() in VIDEOS for p in folder.iterdir()):
         return ""
     return (
-        "videos are not read, and one camera alone has no scale: give images with depth or right "
-        "images beside them, as 'python3 -m app datasets folder' says"
+        "a video needs a camera.yaml beside it, and a second camera or depth, as "
+        "'python3 -m app datasets video' says"
     )
 
 
@@ -111,6 +124,12 @@ def _hint_inside(folder: Path) -> str:
         if len(found) == 1:
             return f"its sub-folder {inner.name} looks like {found[0]}: give {inner}"
     return ""
+
+
+def _holder_of_sequences(path: Path, dataset: str | None) -> Any:
+    """The class of a layout that keeps several sequences in common sub-folders; None for others."""
+    classes = (load_dataset(name) for name in ([dataset] if dataset else DATASETS))
+    return next((found for found in classes if found.inside(path)), None)
 
 
 def _inner_folder(root: Path, name: str) -> Path:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.datasets.files import Size
+from pipelines.datasets.files import DepthCoding, Size
 from pipelines.errors import DatasetError
 from pipelines.types import StereoCamera
 
@@ -20,12 +20,13 @@ RGBD_BF = 40.0  # px * m, virtual right camera of an RGB-D one: 7.5 cm behind 53
 Settings = Mapping[str, str]
 CAMERA_KEYS = (
     *("fx", "fy", "cx", "cy", "width", "height", "bf", "baseline_m"),
-    *("fps", "depth_scale", "depth_form"),
+    *("fps", "depth_scale", "depth_form", "disparity_scale", "stereo"),
 )
 CAMERA_YAML = (
     "camera.yaml with one `key: value` a line: fx, fy, cx, cy in pixels; of a stereo pair "
     "baseline_m (or bf, px * m); of depth images depth_scale, the value of 1 m (1000 for "
-    "millimetres); fps unless there is a times.txt; width and height if you like"
+    "millimetres), or disparity_scale, the value of 1 px; fps unless there is a times.txt; width "
+    "and height if you like"
 )
 
 
@@ -119,6 +120,32 @@ def bf_of(settings: Settings, source: Path) -> float | None:
     if bf is None and baseline_m is not None:
         bf = baseline_m * required(settings, ["fx"], source)[0]
     return bf
+
+
+def depth_coding_of(
+    depths: Iterable[Path], settings: Settings, bf: float, source: Path, scale: float | None = None
+) -> DepthCoding | None:
+    """How the depth images of a camera.yaml are read; None where there are no `depths`.
+
+    disparity_scale: Z = bf / (value / disparity_scale), and goes first, since it is `prepare` that
+    writes it. Else `scale` or depth_scale, with depth_form "metric" or "disparity". bf: px * m.
+    """
+    depths = list(depths)
+    if not depths:
+        return None
+    disparity_scale = number(settings, "disparity_scale", source)
+    if disparity_scale is not None:
+        return DepthCoding("disparity", disparity_scale, bf)
+    scale = scale or number(settings, "depth_scale", source)
+    if scale is None:
+        if any(path.suffix.lower() != ".npy" for path in depths):
+            raise DatasetError(
+                f"{source}: missing calibration, expected depth_scale, the value of 1 m in the "
+                "depth images (1000 for millimetres), found none; add it."
+            )
+        scale = 1.0
+    form = settings.get("depth_form", "metric")
+    return DepthCoding(form, scale, bf)  # type: ignore[arg-type]  # checks the form itself
 
 
 def read_matrix(path: Path) -> np.ndarray:

@@ -14,6 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipelines.datasets.files import (
     DamagedFileError,
     DepthCoding,
@@ -23,6 +26,7 @@ from pipelines.datasets.files import (
     read_image,
     read_labels,
 )
+from pipelines.datasets.mask_classes import read_mask_classes
 from pipelines.datasets.sequence import Sequence
 from pipelines.datasets.tree import describe_folder
 from pipelines.errors import DatasetError, FrameError
@@ -38,6 +42,7 @@ class FrameFiles:
 
     A path that does not exist is an input missing from this frame alone.
     flow_prev_to_curr: lies on the grid of the previous frame and points into this one.
+    classes: json that names the instances of `labels`, see `mask_classes`.
     """
 
     image: Path
@@ -45,6 +50,7 @@ class FrameFiles:
     depth: Path | None = None
     flow_prev_to_curr: Path | None = None
     labels: Path | None = None
+    classes: Path | None = None
 
 
 class FileSequence(Sequence):
@@ -83,14 +89,7 @@ class FileSequence(Sequence):
     @classmethod
     def open(cls, path: Path | str, **options: Any) -> Self:
         """The sequence in `path`; raises DatasetError where something essential is missing."""
-        known = [name for name in inspect.signature(cls._open).parameters if name != "root"]
-        for name in options:
-            if name not in known:
-                nearest = difflib.get_close_matches(name, known, 1)
-                raise DatasetError(
-                    f"Data set {cls.dataset}: unknown option {name!r}, "
-                    + (f"did you mean {nearest[0]!r}?" if nearest else f"known: {', '.join(known)}")
-                )
+        check_options(cls.dataset, cls._open, options)
         root = Path(path)
         if not root.is_dir():
             raise DatasetError(
@@ -114,47 +113,80 @@ class FileSequence(Sequence):
             raise IndexError(f"frame {index} of {self.name}, which has {len(self)}")
         files, size = self._frames[index], (self.camera.width, self.camera.height)
         image = read_image(files.image, size)
-        right = self._read_optional(index, "right image", files.image_right, size, read_image)
+        right = read_optional(index, "right image", files.image_right, size, read_image)
         if right is not None and right.shape != image.shape:
             raise FrameError(
                 f"{files.image_right}: expected the same channels as the left image "
                 f"{image.shape}, found {right.shape}; convert one of them."
             )
+        labels = read_optional(index, "mask", files.labels, size, read_labels)
         return Frame(
             index=index,
             timestamp_s=float(self.timestamps_s[index]),
             image=image,
             image_right=right,
-            depth_m=self._read_optional(index, "depth", files.depth, size, self._decode_depth),
-            flow_prev_to_curr_px=self._read_optional(
-                index, "flow", files.flow_prev_to_curr, size, read_flow
+            depth_m=read_optional(index, "depth", files.depth, size, self._decode_depth),
+            flow_prev_to_curr_px=read_optional(
+                index, "flow", files.flow_prev_to_curr, size, self._decode_flow
             ),
-            instance_labels=self._read_optional(index, "mask", files.labels, size, read_labels),
+            instance_labels=labels,
+            instance_classes=None if labels is None else self._read_classes(index, labels),
         )
+
+    def files(self, index: int) -> FrameFiles:
+        """The files of frame `index`, for those who copy or link them."""
+        return self._frames[index]
+
+    @property
+    def depth_coding(self) -> DepthCoding | None:
+        """How the depth images are read; None where there are none."""
+        return self._depth_coding
+
+    def _read_classes(self, index: int, labels: NDArray[np.int32]) -> dict[int, str] | None:
+        """Class names of the instances in `labels`, None where the sequence does not say."""
+        path, size = self._frames[index].classes, (self.camera.width, self.camera.height)
+        if path is None or not path.exists():
+            return None  # most masks come without, and no frame is the worse for it
+        return read_optional(index, "classes", path, size, lambda p, _: read_mask_classes(p))
+
+    def _decode_flow(self, path: Path, size: Size) -> NDArray[np.float32]:
+        return read_flow(path, size)
 
     def _decode_depth(self, path: Path, size: Size) -> Any:
         if self._depth_coding is None:
             raise DatasetError(f"{path}: depth without a scale; set depth_scale.")
         return read_depth(path, self._depth_coding, size)
 
-    def _read_optional(
-        self,
-        index: int,
-        what: str,
-        path: Path | None,
-        size: Size,
-        read: Callable[[Path, Size], Read],
-    ) -> Read | None:
-        if path is None:
-            return None
-        if not path.exists():
-            log.warning("frame %d has no %s: %s is missing", index, what, path)
-            return None
-        try:
-            return read(path, size)
-        except DamagedFileError as error:
-            log.warning("frame %d goes without %s: %s", index, what, error)
-            return None
+
+def read_optional(
+    index: int, what: str, path: Path | None, size: Size, read: Callable[[Path, Size], Read]
+) -> Read | None:
+    """What `read` makes of `path`; None, with a warning, where that is missing or damaged.
+
+    None as well, without one, where `path` is None. A file of a wrong size or form is FrameError.
+    """
+    if path is None:
+        return None
+    if not path.exists():
+        log.warning("frame %d has no %s: %s is missing", index, what, path)
+        return None
+    try:
+        return read(path, size)
+    except DamagedFileError as error:
+        log.warning("frame %d goes without %s: %s", index, what, error)
+        return None
+
+
+def check_options(dataset: str, opener: Callable[..., Any], options: dict[str, Any]) -> None:
+    """Raise DatasetError, naming the nearest, for an option that `opener` does not take."""
+    known = [name for name in inspect.signature(opener).parameters if name != "root"]
+    for name in options:
+        if name not in known:
+            nearest = difflib.get_close_matches(name, known, 1)
+            raise DatasetError(
+                f"Data set {dataset}: unknown option {name!r}, "
+                + (f"did you mean {nearest[0]!r}?" if nearest else f"known: {', '.join(known)}")
+            )
 
 
 def common_image_size(images: list[Path], settings_size: Size | None, source: str) -> Size:

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.datasets.palette import indices_as_grey, is_palette_png
 from pipelines.errors import DatasetError, FrameError
 from pipelines.types import Image
 
@@ -136,14 +137,37 @@ def read_flow(path: Path, size: Size | None = None) -> NDArray[np.float32]:
     return flow
 
 
+def read_normalised_flow(path: Path, size: Size | None = None) -> NDArray[np.float32]:
+    """Flow (H, W, 2) float32 in pixels, NaN unknown, from Virtual KITTI's 16-bit colour PNG.
+
+    Red and green hold du / (W - 1) and dv / (H - 1) of -1 to 1 as 0 to 65535; blue is 0 where there
+    is no flow, as in the sky. Raises FrameError.
+    """
+    pixels = _decode(path, "a flow image")  # blue, green, red
+    if pixels.dtype != np.uint16 or pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise FrameError(
+            f"Flow {path}: expected a 16-bit image of three channels, found {pixels.dtype} "
+            f"{pixels.shape}; copy the file as it was published."
+        )
+    _check_size(path, "flow", pixels, size)
+    height, width = pixels.shape[:2]
+    flow = pixels[..., 2:0:-1].astype(np.float32) * np.float32(2 / SATURATED) - np.float32(1)
+    flow *= np.array([width - 1, height - 1], np.float32)
+    flow[pixels[..., 0] == 0] = np.nan
+    return np.ascontiguousarray(flow)
+
+
 def read_labels(path: Path, size: Size) -> NDArray[np.int32]:
-    """Instance labels (H, W) int32, 0 background, from .txt, .png or .npy. Raises FrameError."""
+    """Instance labels (H, W) int32, 0 background, from .txt, .png or .npy. Raises FrameError.
+
+    Of a PNG with a palette the indices are the labels.
+    """
     if path.suffix == ".txt":
         labels = _read_label_text(path, size)
     elif path.suffix == ".npy":
         labels = _load_array(path, "a label array")
     else:
-        labels = _decode(path, "a label image")
+        labels = _decode(path, "a label image", indices=True)
     if labels.ndim != 2 or not np.issubdtype(labels.dtype, np.integer):
         raise FrameError(
             f"Labels {path}: expected one integer per pixel, found {labels.shape} {labels.dtype}."
@@ -164,8 +188,11 @@ def _read_bytes(path: Path, what: str) -> bytes:
     return content
 
 
-def _decode(path: Path, what: str) -> NDArray:
-    content = np.frombuffer(_read_bytes(path, what), np.uint8)
+def _decode(path: Path, what: str, indices: bool = False) -> NDArray:
+    read = _read_bytes(path, what)
+    if indices and is_palette_png(read):
+        read = indices_as_grey(read)
+    content = np.frombuffer(read, np.uint8)
     try:
         pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
     except cv2.error:

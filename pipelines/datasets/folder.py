@@ -12,6 +12,7 @@ from pipelines.datasets.calibration import (
     CAMERA_YAML,
     RGBD_BF,
     bf_of,
+    depth_coding_of,
     make_camera,
     number,
     read_camera_yaml,
@@ -19,17 +20,18 @@ from pipelines.datasets.calibration import (
     settings_size,
 )
 from pipelines.datasets.file_sequence import FileSequence, FrameFiles, common_image_size
-from pipelines.datasets.files import DepthCoding
 from pipelines.datasets.timestamps import frame_times
 from pipelines.datasets.tree import first_folder, list_files, tree_error
 from pipelines.datasets.truth import read_tum_poses
 from pipelines.errors import DatasetError
+from pipelines.io.files import read_json
 from pipelines.types import GroundTruth
 
 IMAGE_FOLDERS = ("images", "left", "image", "rgb", "color")
 DEPTH_SUFFIXES = (".png", ".npy")
 FLOW_SUFFIXES = (".flo", ".npy")
 MASK_SUFFIXES = (".png", ".npy", ".txt")
+PREPARED = "prepared.json"  # written by prepare: kind of file -> the settings that made it
 LISTS = ("associations.txt", "associate.txt", "rgb.txt")  # of tum_rgbd
 
 
@@ -39,8 +41,9 @@ class FolderSequence(FileSequence):
     dataset = "folder"
     layout = (
         "images/ (or left/, image/, rgb/, color/), depth/ (16-bit PNG or .npy in metres) or "
-        "right/, camera.yaml; optional times.txt, flow/ (.flo or .npy, k to k + 1), masks/ "
-        "(.png, .npy or .txt of labels), groundtruth.txt (TUM)"
+        "right/, camera.yaml; optional times.txt, flow/ (.flo or .npy; that of frame k, by its "
+        "name, leads to k + 1), masks/ (.png, .npy or .txt of labels, with .json of the same name "
+        'for their classes: {"1": {"class": "car", "score": 0.9}}), groundtruth.txt (TUM)'
     )
 
     @classmethod
@@ -55,8 +58,17 @@ class FolderSequence(FileSequence):
         return not foreign and any((path / other).is_dir() for other in ("depth", "right"))
 
     @classmethod
-    def _open(cls, root: Path, depth_scale: float | None = None, fps: float | None = None) -> Self:
-        """The sequence in `root`; options override camera.yaml."""
+    def _open(
+        cls,
+        root: Path,
+        depth_scale: float | None = None,
+        fps: float | None = None,
+        prepared: bool = True,
+    ) -> Self:
+        """The sequence in `root`.
+
+        depth_scale, fps: override camera.yaml. prepared: False leaves out what `prepare` has made.
+        """
         folder = first_folder(root, IMAGE_FOLDERS)
         images = list_files(folder) if folder else {}
         if not images:
@@ -65,14 +77,17 @@ class FolderSequence(FileSequence):
         if not yaml.is_file():
             advice = f"Add {CAMERA_YAML}."
             raise tree_error(cls.dataset, cls.layout, root, "missing calibration", advice)
-        depths = list_files(root / "depth", DEPTH_SUFFIXES)
-        rights = {} if depths else list_files(root / "right")
+        hidden = set() if prepared else prepared_kinds(root)
+        depths = {} if "depth" in hidden else list_files(root / "depth", DEPTH_SUFFIXES)
+        rights = list_files(root / "right")
         if not depths and not rights:
             advice = "Add one of them: one camera alone has no scale."
             raise tree_error(cls.dataset, cls.layout, root, "no depth and no right images", advice)
         settings = read_camera_yaml(yaml)
         fx, fy, cx, cy = required(settings, ("fx", "fy", "cx", "cy"), yaml)
         bf = bf_of(settings, yaml)
+        if bf is None and depths:
+            rights = {}  # images of a second camera that nobody measured
         if bf is None and rights:
             raise DatasetError(
                 f"{yaml}: missing calibration, expected bf (px * m) or baseline_m of the stereo "
@@ -83,9 +98,9 @@ class FolderSequence(FileSequence):
         camera = make_camera(size, fx, fy, cx, cy, bf or RGBD_BF, yaml, is_rgbd)
         fps = fps or number(settings, "fps", yaml)
         times_s = frame_times(root / "times.txt", fps, len(images), root)
-        scale = depth_scale or number(settings, "depth_scale", yaml)
-        coding = _coding(depths, scale, settings.get("depth_form", "metric"), camera.bf, yaml)
-        return cls(root, camera, times_s, _frame_files(root, images, depths, rights), coding)
+        coding = depth_coding_of(depths.values(), settings, camera.bf, yaml, depth_scale)
+        frames = _frame_files(root, images, depths, rights, hidden)
+        return cls(root, camera, times_s, frames, coding)
 
     def ground_truth(self) -> GroundTruth | None:
         path = self.root / "groundtruth.txt"
@@ -94,27 +109,25 @@ class FolderSequence(FileSequence):
         return GroundTruth(self.timestamps_s, read_tum_poses(path, self.timestamps_s))
 
 
-def _coding(
-    depths: dict[str, Path], scale: float | None, form: str, bf: float, yaml: Path
-) -> DepthCoding | None:
-    if not depths:
-        return None
-    if scale is None:
-        if any(path.suffix.lower() == ".png" for path in depths.values()):
-            raise DatasetError(
-                f"{yaml}: missing calibration, expected depth_scale, the value of 1 m in the depth "
-                "images (1000 for millimetres), found none; add it."
-            )
-        scale = 1.0
-    return DepthCoding(form, scale, bf)  # type: ignore[arg-type]  # checks the form itself
+def prepared_kinds(root: Path) -> set[str]:
+    """Kinds of files in `root` (depth, flow, masks) that `prepare` has made."""
+    path = root / PREPARED
+    return set(read_json(path)) if path.is_file() else set()
 
 
 def _frame_files(
-    root: Path, images: dict[str, Path], depths: dict[str, Path], rights: dict[str, Path]
+    root: Path,
+    images: dict[str, Path],
+    depths: dict[str, Path],
+    rights: dict[str, Path],
+    hidden: set[str],
 ) -> list[FrameFiles]:
-    """Files by stem; one that is absent from a kind that others have gets a path all the same."""
-    flows = list_files(root / "flow", FLOW_SUFFIXES)
-    masks = list_files(root / "masks", MASK_SUFFIXES)
+    """Files by stem; one that is absent from a kind that others have gets a path all the same.
+
+    But where there are right images too, a frame without depth has its right image.
+    """
+    flows = {} if "flow" in hidden else list_files(root / "flow", FLOW_SUFFIXES)
+    masks = {} if "masks" in hidden else list_files(root / "masks", MASK_SUFFIXES)
     stems = list(images)
 
     def file_of(found: dict[str, Path], stem: str) -> Path | None:
@@ -123,13 +136,18 @@ def _frame_files(
         example = next(iter(found.values()))
         return found.get(stem, example.with_name(stem + example.suffix))
 
-    return [
-        FrameFiles(
-            image=images[stem],
-            image_right=file_of(rights, stem),
-            depth=file_of(depths, stem),
-            flow_prev_to_curr=file_of(flows, stems[k - 1]) if k > 0 else None,
-            labels=file_of(masks, stem),
+    frames = []
+    for k, stem in enumerate(stems):
+        by_stereo = bool(rights) and stem not in depths
+        mask = file_of(masks, stem)
+        frames.append(
+            FrameFiles(
+                image=images[stem],
+                image_right=file_of(rights, stem) if by_stereo else None,
+                depth=None if by_stereo else file_of(depths, stem),
+                flow_prev_to_curr=file_of(flows, stems[k - 1]) if k > 0 else None,
+                labels=mask,
+                classes=mask.with_suffix(".json") if mask else None,
+            )
         )
-        for k, stem in enumerate(stems)
-    ]
+    return frames

@@ -10,14 +10,13 @@ from typing import Self
 
 import numpy as np
 
-from pipelines.datasets.calibration import make_camera
 from pipelines.datasets.file_sequence import FileSequence, FrameFiles, common_image_size
 from pipelines.datasets.files import DepthCoding, DepthForm, Size
+from pipelines.datasets.kitti_calibration import T_camera0_camera, stereo_camera
 from pipelines.datasets.timestamps import frame_times
 from pipelines.datasets.tree import first_folder, frame_numbers, list_files, tree_error
 from pipelines.datasets.truth import read_kitti_poses
 from pipelines.errors import DatasetError
-from pipelines.geometry import make_T
 from pipelines.types import Array, GroundTruth, StereoCamera
 
 PAIRS = {"image_0": ("image_1", 0), "image_2": ("image_3", 2)}  # left: right, number of its P
@@ -108,10 +107,7 @@ class KittiOdometrySequence(FileSequence):
         Ts_world_camera0 = read_kitti_poses(path, self._numbers)
         number = PAIRS[self._frames[0].image.parent.name][1]
         P = _read_projections(self.root / "calib.txt")[number]
-        # KITTI's poses are camera 0's; P = K [I | t] places the colour camera 6 cm beside it.
-        offset_m = -np.linalg.solve(P[:, :3], P[:, 3]).astype(np.float64)
-        T_camera0_camera = make_T(np.eye(3), offset_m)
-        return GroundTruth(self.timestamps_s, Ts_world_camera0 @ T_camera0_camera)
+        return GroundTruth(self.timestamps_s, Ts_world_camera0 @ T_camera0_camera(P))
 
 
 def _read_projections(path: Path) -> dict[int, Array]:
@@ -143,5 +139,4 @@ def _read_camera(path: Path, number: int, size: Size) -> StereoCamera:
             f"{path}: missing calibration, expected P{number} and P{number + 1}, found "
             f"{', '.join(f'P{n}' for n in projections) or 'none'}; copy calib.txt from KITTI."
         )
-    P, P_right = projections[left], projections[right]
-    return make_camera(size, P[0, 0], P[1, 1], P[0, 2], P[1, 2], P[0, 3] - P_right[0, 3], path)
+    return stereo_camera(projections[left], projections[right], size, path)

@@ -24,6 +24,15 @@ class Sequence(ABC):
     camera: StereoCamera
     timestamps_s: Array
 
+    @classmethod
+    def inside(cls, path: Path) -> list[str]:
+        """Names of the sequences that a folder of this layout holds in common sub-folders.
+
+        Empty where each sequence has a folder of its own, which is then given by its path. Where it
+        is not, the layout's option `sequence` takes one of the names.
+        """
+        return []
+
     def __len__(self) -> int:
         return len(self.timestamps_s)
 

@@ -36,12 +36,19 @@ def read_rows(path: Path, n_columns: int, what: str) -> Array:
 def read_tum_poses(path: Path, timestamps_s: Array) -> Array:
     """Ts_world_camera (N, 4, 4) at `timestamps_s` from `time tx ty tz qx qy qz qw` rows.
 
-    Between two poses at most 0.15 s apart: linear in position, slerp in rotation. Else the nearest
-    pose within 0.02 s. NaN where there is neither.
+    See `poses_at` for what lies between two rows.
+    """
+    return poses_at(read_rows(path, 8, "time tx ty tz qx qy qz qw"), timestamps_s)
+
+
+def poses_at(rows: Array, timestamps_s: Array) -> Array:
+    """Poses (N, 4, 4) at `timestamps_s` from rows (M, 8): time, position in m, q_xyzw.
+
+    Between two rows at most 0.15 s apart: linear in position, slerp in rotation. Else the nearest
+    row within 0.02 s. NaN where there is neither.
     """
     from scipy.spatial.transform import Rotation, Slerp
 
-    rows = read_rows(path, 8, "time tx ty tz qx qy qz qw")
     rows = rows[np.isfinite(rows).all(1) & (np.linalg.norm(rows[:, 4:], axis=1) > 0.5)]
     rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
     Ts = np.full((len(timestamps_s), 4, 4), np.nan)

@@ -20,7 +20,12 @@ from pipelines.datasets.calibration import (
     settings_size,
 )
 from pipelines.datasets.depth_form import disparity_share
-from pipelines.datasets.file_sequence import FileSequence, FrameFiles, common_image_size
+from pipelines.datasets.file_sequence import (
+    FileSequence,
+    FrameFiles,
+    common_image_size,
+    read_optional,
+)
 from pipelines.datasets.files import DepthCoding, DepthForm, read_depth_values, read_labels
 from pipelines.datasets.timestamps import frame_times
 from pipelines.datasets.tree import (
@@ -125,7 +130,7 @@ class VdoSequence(FileSequence):
 
     def _read_mask(self, index: int) -> NDArray[np.int32] | None:
         labels, size = self._frames[index].labels, (self.camera.width, self.camera.height)
-        return self._read_optional(index, "mask", labels, size, read_labels)
+        return read_optional(index, "mask", labels, size, read_labels)
 
 
 def depth_coding(

@@ -66,6 +66,13 @@ def test_a_full_sequence_is_fit(monkeypatch) -> None:
     assert found["camera"].words == "8x6, focal length 10.0 px, baseline 500 mm"
 
 
+def test_masks_that_name_classes_are_told(monkeypatch) -> None:
+    labels = np.array([[1, 2, 5]], np.int32).repeat(6, 0).repeat(3, 1)[:, :8]
+    classes = {1: "car", 2: "car", 5: "bus"}
+    found = findings(monkeypatch, Sequence(instance_labels=labels, instance_classes=classes))
+    assert "masks of 3 (bus, car)" in found["frame 1"].words
+
+
 def test_a_right_image_is_as_good_as_depth(monkeypatch) -> None:
     found = findings(monkeypatch, Sequence(image_right=np.zeros((6, 8), np.uint8)))
     assert found["frame 0"].verdict is Verdict.OK

@@ -16,9 +16,37 @@ from pipelines.datasets.sequence import Sequence
 from pipelines.errors import DatasetError, FrameError
 from pipelines.types import Frame
 
-FROM_FOLDERS = ["vdo", "kitti_odometry", "tum_rgbd", "folder"]
-TRUTH_FILES = ("pose_gt.txt", "object_pose.txt", "poses.txt", "groundtruth.txt")
+# Data set: its images, and the depth or right images beside them.
+FILES = {
+    "vdo": ("image_0/*", "depth/*"),
+    "kitti_odometry": ("image_0/*", "image_1/*"),
+    "kitti_tracking": ("image_02/0003/*", "image_03/0003/*"),
+    "virtual_kitti2": ("frames/rgb/Camera_0/*", "frames/depth/Camera_0/*"),
+    "omd": ("rgbd/*_color.png", "rgbd/*_aligned_depth.png"),
+    "tum_rgbd": ("rgb/*", "depth/*"),
+    "folder": ("images/*", "depth/*"),
+}
+FROM_FOLDERS = list(FILES)
+TRUTH_FILES = (
+    *("pose_gt.txt", "object_pose.txt", "poses.txt", "groundtruth.txt", "vicon.csv"),
+    *("oxts/0003.txt", "label_02/0003.txt", "extrinsic.txt", "pose.txt", "bbox.txt"),
+)
+CALIBRATIONS = {
+    "vdo": ("settings.yaml",),
+    "kitti_odometry": ("calib.txt",),
+    "kitti_tracking": ("calib/0003.txt",),
+    "virtual_kitti2": ("intrinsic.txt",),
+    "omd": ("kalibr.yaml", "manufacturer.yaml"),
+}
 Write = Callable[[str], Path]
+
+
+def images_of(dataset: str, root: Path) -> list[Path]:
+    return sorted(root.glob(FILES[dataset][0]))
+
+
+def partners_of(dataset: str, root: Path) -> list[Path]:
+    return sorted(root.glob(FILES[dataset][1]))
 
 
 def same(a: Frame, b: Frame) -> bool:
@@ -27,9 +55,16 @@ def same(a: Frame, b: Frame) -> bool:
         one, other = getattr(a, field.name), getattr(b, field.name)
         if (one is None) != (other is None):
             return False
-        if one is not None and not np.array_equal(one, other, equal_nan=np.ndim(one) > 0):
+        if isinstance(one, dict):
+            if one != other:
+                return False
+        elif one is not None and not np.array_equal(one, other, equal_nan=np.ndim(one) > 0):
             return False
     return True
+
+
+def test_every_layout_keeps_the_contract() -> None:
+    assert set(DATASETS) - {"simulated", "video"} == set(FILES)
 
 
 @pytest.mark.parametrize("dataset", DATASETS)
@@ -51,7 +86,7 @@ def test_frames_keep_the_contract(dataset: str, write_tree: Write) -> None:
     sequence = open_sequence(write_tree(dataset))
     assert len(sequence) == 4
     assert sequence.dataset == dataset
-    assert sequence.name == f"{dataset}_tree"
+    assert sequence.name == ("0003" if dataset == "kitti_tracking" else f"{dataset}_tree")
     assert np.all(np.diff(sequence.timestamps_s) > 0)
     camera = sequence.camera
     for k in range(len(sequence)):
@@ -76,7 +111,8 @@ def test_truth_has_one_pose_per_frame(dataset: str, write_tree: Write) -> None:
     Ts = truth.Ts_world_camera
     assert Ts.shape == (len(sequence), 4, 4)
     np.testing.assert_array_equal(truth.timestamps_s, sequence.timestamps_s)
-    np.testing.assert_allclose(np.diff(Ts[:, 2, 3]), 0.5, atol=1e-5)
+    ahead = (np.linalg.inv(Ts[:-1]) @ Ts[1:])[:, :3, 3]  # whatever the world
+    np.testing.assert_allclose(ahead, [[0, 0, 0.5]] * 3, atol=1e-5)
 
 
 @pytest.mark.parametrize("dataset", FROM_FOLDERS)
@@ -112,8 +148,7 @@ def test_damaged_truth_is_not_read_before_it_is_asked_for(dataset: str, write_tr
 @pytest.mark.parametrize("dataset", FROM_FOLDERS)
 def test_unreadable_image_fails_its_frame_alone(dataset: str, write_tree: Write) -> None:
     root = write_tree(dataset)
-    folder = next(root / name for name in ("image_0", "rgb", "images") if (root / name).is_dir())
-    damaged = sorted(folder.iterdir())[0]
+    damaged = images_of(dataset, root)[0]
     damaged.write_bytes(damaged.read_bytes()[:50])
     sequence = open_sequence(root)
     with pytest.raises(FrameError, match="cannot be decoded") as error:
@@ -125,8 +160,7 @@ def test_unreadable_image_fails_its_frame_alone(dataset: str, write_tree: Write)
 @pytest.mark.parametrize("dataset", FROM_FOLDERS)
 def test_image_of_wrong_size_fails_its_frame_alone(dataset: str, write_tree: Write) -> None:
     root = write_tree(dataset)
-    folder = next(root / name for name in ("image_0", "rgb", "images") if (root / name).is_dir())
-    wrong = sorted(folder.iterdir())[1]
+    wrong = images_of(dataset, root)[1]
     assert cv2.imwrite(str(wrong), np.zeros((20, 30, 3), np.uint8))
     sequence = open_sequence(root)
     with pytest.raises(FrameError, match=r"expected image of 64 x 48.*found 30 x 20"):
@@ -139,8 +173,7 @@ def test_missing_depth_or_right_image_of_one_frame(
     dataset: str, write_tree: Write, caplog: pytest.LogCaptureFixture
 ) -> None:
     root = write_tree(dataset)
-    folder = root / ("image_1" if dataset == "kitti_odometry" else "depth")
-    lost, damaged = sorted(folder.iterdir())[1:3]
+    lost, damaged = partners_of(dataset, root)[1:3]
     lost.unlink()
     damaged.write_bytes(b"not an image")
     sequence = open_sequence(root)
@@ -158,8 +191,8 @@ def test_missing_depth_or_right_image_of_one_frame(
 @pytest.mark.parametrize("dataset", FROM_FOLDERS)
 def test_missing_calibration_says_what_to_add(dataset: str, write_tree: Write) -> None:
     root = write_tree(dataset)
-    files = {"vdo": "settings.yaml", "kitti_odometry": "calib.txt"}
-    (root / files.get(dataset, "camera.yaml")).unlink()
+    for name in CALIBRATIONS.get(dataset, ("camera.yaml",)):
+        (root / name).unlink()
     with pytest.raises(DatasetError, match=r"missing calibration.*Expected: .*Found: "):
         open_sequence(root)
 
@@ -167,8 +200,8 @@ def test_missing_calibration_says_what_to_add(dataset: str, write_tree: Write) -
 @pytest.mark.parametrize("dataset", FROM_FOLDERS)
 def test_missing_images_say_what_tree_was_expected(dataset: str, write_tree: Write) -> None:
     root = write_tree(dataset)
-    for name in ("image_0", "image_1", "rgb", "images"):
-        shutil.rmtree(root / name, ignore_errors=True)
+    for path in {*images_of(dataset, root), *root.glob("image_1/*"), *root.glob("image_03/*/*")}:
+        path.unlink()
     with pytest.raises(DatasetError, match=r"no images.*Expected: .*Found: "):
         open_sequence(root, dataset)
 
@@ -182,10 +215,9 @@ def test_unknown_option_names_the_known(dataset: str, write_tree: Write) -> None
 @pytest.mark.parametrize("dataset", FROM_FOLDERS)
 def test_black_images_and_empty_depth_are_frames_too(dataset: str, write_tree: Write) -> None:
     root = write_tree(dataset)
-    for name in ("image_0", "image_1", "rgb", "images", "depth"):
-        for path in sorted((root / name).glob("*.png")):
-            pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-            assert cv2.imwrite(str(path), np.zeros_like(pixels))
+    for path in images_of(dataset, root) + partners_of(dataset, root):
+        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert cv2.imwrite(str(path), np.zeros_like(pixels))
     frame = open_sequence(root).read(1)
     assert not frame.image.any()
     if frame.depth_m is not None:

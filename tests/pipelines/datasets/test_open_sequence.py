@@ -30,10 +30,16 @@ def test_missing_folder_with_a_forced_data_set(tmp_path: Path) -> None:
 
 def test_file_in_place_of_a_folder(tmp_path: Path) -> None:
     (tmp_path / "film.mkv").write_bytes(b"x")
-    with pytest.raises(DatasetError, match="expected a folder of images, since videos"):
+    with pytest.raises(DatasetError, match=r"film\.mkv: expected a video, found a file of 1 bytes"):
         open_sequence(tmp_path / "film.mkv")
-    with pytest.raises(DatasetError, match="videos are not read, and one camera alone"):
+    with pytest.raises(DatasetError, match=r"a video needs a camera\.yaml beside it, and a second"):
         open_sequence(tmp_path)
+    (tmp_path / "notes.txt").write_text("x")
+    with pytest.raises(DatasetError, match=r"expected a folder or a video \(.*found another file"):
+        open_sequence(tmp_path / "notes.txt")
+    (tmp_path / "room.bag").write_bytes(b"x")
+    with pytest.raises(DatasetError, match="images exported from it, since bags are not read"):
+        open_sequence(tmp_path / "room.bag")
 
 
 def test_empty_folder(tmp_path: Path) -> None:
