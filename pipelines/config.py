@@ -128,6 +128,7 @@ class DetectorConfig:
     name: str = "auto"
     model: str = ""  # path of the network's ONNX file, empty = where `models fetch` puts it
     every_n: int = 1  # the network runs on every n-th frame; between, masks are carried by flow
+    timeout_ms: float = 0.0  # ms, a later answer is not waited for: masks are carried; 0 = wait
     min_score: float = 0.35  # detections below are dropped
     max_instances: int = 100  # the best are kept
     # px, images are scaled to this width for the network; 0 = its own, or for a yolo_seg network of
@@ -156,6 +157,7 @@ class DetectorConfig:
     )
 
     def __post_init__(self) -> None:
+        _check(self, timeout_ms=(0, _ANY))
         _check(self, every_n=(1, 1000), min_score=(0, 1), max_instances=(1, 1000))
         _check(self, input_width_px=(0, 8192), threads=(1, 256))
 
@@ -194,7 +196,8 @@ class ObjectsConfig:
     significance: float = 3.0  # standard deviations above that to be moving
     scene_flow_m: float = 0.12  # m a frame, a point with more scene flow moves (VDO-SLAM, KITTI)
     scene_flow_share: float = 0.3  # still points above which an object is still (VDO-SLAM, KITTI)
-    still_after_s: float = 1.0  # s, a thing still for so long serves the camera as landmark
+    still_after_s: float = 1.0  # s, a thing still for so long may serve the camera as landmark
+    landmarks_below: float = 0.4  # share of features off objects, below which it does
     max_carried_s: float = 0.5  # s, a mask is carried by flow so long without a detection
     max_age_s: float = 3.0  # s, an object out of sight so long is forgotten
     acceleration_mps2: float = 3.0  # m/s^2, how fast objects change their speed (process noise)
@@ -206,6 +209,7 @@ class ObjectsConfig:
         _check(self, max_turn_std_deg=(0.001, 180))
         _check(self, min_speed_mps=(0, _ANY), significance=(0, 100))
         _check(self, scene_flow_m=(0, _ANY), scene_flow_share=(0, 1), still_after_s=(0, _ANY))
+        _check(self, landmarks_below=(0, 1))
         _check(self, max_carried_s=(0, _ANY), max_age_s=(0, _ANY))
         _check(self, acceleration_mps2=(0.01, _ANY), turn_radps2=(0.01, _ANY))
 

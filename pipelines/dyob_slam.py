@@ -1,15 +1,15 @@
 """The system: a frame goes in, a result comes out.
 
 Owns the order of the steps and the state between frames. Each step is a function or a small class
-in `depth`, `frontend` and `mapping`; ground truth never comes near. The steps have the numbers of
-the design: 2 (dense flow) comes with the sequence, 5 to 9 (moving objects) are not here yet.
+in `depth`, `perception`, `frontend`, `objects` and `mapping`; ground truth never comes near. The
+steps have the numbers of the design.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -24,9 +24,11 @@ from pipelines.frontend.tracking import TrackedFrame, Tracker
 from pipelines.frontend.view import PreparedFrame, View, complete_view, prepare_frame
 from pipelines.mapping.local_mapping import LocalMapping
 from pipelines.mapping.sparse_map import SparseMap
-from pipelines.object_types import Detections
+from pipelines.object_types import ObjectEstimates
+from pipelines.objects.frame import ObjectFrame
 from pipelines.objects.tracking import ObjectTracker
 from pipelines.observations import Tracks
+from pipelines.perception import DenseFlow, Segmentation
 from pipelines.types import (
     Array,
     Frame,
@@ -54,12 +56,15 @@ class DyObSlam:
         self.sensor = Sensor(camera, self.config.depth)
         self._tracker = Tracker(self.sensor, self.config.tracking)
         self._mapping = LocalMapping(self.sensor, self.config.mapping, self.config.orb)
-        self._objects = ObjectTracker(self.sensor, self.config.objects)
+        self._segmentation = Segmentation(self.config.detector)
+        self._flow = DenseFlow(self.config.flow)
+        self._objects = ObjectTracker(self.sensor, self.config.objects, self.config.tracking.seed)
+        self._landmarks: set[int] = set()
         self._lost_frames = 0
         self._timings_ms: dict[str, float] = {}
 
     def process(self, frame: Frame | PreparedFrame) -> FrameResult:
-        """Track one frame and grow the map. Frames must come in order of time.
+        """Track one frame: camera, objects, map. Frames must come in order of time.
 
         A frame that `prepare` has had before, in another thread say, is not prepared again.
         """
@@ -69,47 +74,51 @@ class DyObSlam:
         with self._stage("view"):
             sigma, offset = self.sensor.noise.sigma_disparity_px, self.sensor.offset.offset_px
             view = complete_view(self.camera, prepared, sigma, offset)
-        objects, frame_objects = self._objects, None
-        T_predicted = self._predicted_pose(view.timestamp_s)
+        # 7. Which detection is which object; masks that are missed are carried on
         with self._stage("objects"):
-            flow = view.flow_prev_to_curr_px
-            frame_objects = objects.associate(view, flow, detections(prepared.frame), T_predicted)
+            objects = self._objects.associate(view, prepared.detections, self._predict(view))
+            view = view.masked(self._labels_that_move(objects, view), self._dilation_px)
         # 4. Camera pose
         tracked = self._track(view)
+        # 8, 9 and 5. Object motion, Kalman filters, what moves
         with self._stage("objects"):
-            estimates = objects.estimate(
-                view, flow, frame_objects, tracked.T_world_camera, tracked.covariance
+            estimates = self._objects.estimate(
+                view, objects, tracked.T_world_camera, tracked.covariance
             )
+            self._forget_landmarks(view, tracked, objects)
         # 10. Sparse map
         with self._stage("mapping"):
             is_keyframe = self._grow_map(view, tracked)
         self._timings_ms["total"] = sum(self._timings_ms.values())
-        return replace(
-            self._result(prepared.frame, tracked, is_keyframe),
-            objects=estimates,
-            object_labels=frame_objects.labels,
-        )
-
-    def _predicted_pose(self, timestamp_s):
-        motion = self._tracker.motion
-        return np.eye(4) if motion is None else motion.predict(timestamp_s)
+        return self._result(prepared.frame, tracked, is_keyframe, estimates, objects)
 
     def prepare(self, frame: Frame) -> PreparedFrame:
-        """The part of a frame's work that depends on no other frame; it may run ahead of `process`.
+        """The part of a frame's work that needs images alone; it may run ahead of `process`.
 
-        Frames may be prepared in one thread while another processes; the answers are the same.
-        Raises FrameError for an image that is not of the camera's size.
+        Frames are prepared in their order, perhaps in one thread while another processes; the
+        answers are the same. Raises FrameError for an image that is not of the camera's size,
+        ModelError where a network's file is missing or damaged.
         """
         _check_size(self.camera, frame)
-        begin = time.perf_counter()
+        spent: dict[str, float] = {}
         # 0. Depth, given or by stereo
-        depth_m = self._depth(frame)
-        middle = time.perf_counter()
-        # 1 and 3. Movable objects are masked; ORB features on the static part
-        prepared = prepare_frame(self.camera, frame, depth_m, self._orb)
-        end = time.perf_counter()
-        timings_ms = {"depth": 1e3 * (middle - begin), "features": 1e3 * (end - middle)}
-        return replace(prepared, timings_ms=timings_ms)
+        with timed(spent, "depth"):
+            depth_m = self._depth(frame)
+        # 1. Masks of movable things
+        with timed(spent, "detection"):
+            detections = self._segmentation.detect(frame)
+        # 2. Dense flow from the frame before
+        with timed(spent, "flow"):
+            flow_px = self._flow.compute(frame)
+        # 3. ORB features
+        with timed(spent, "features"):
+            prepared = prepare_frame(self.camera, frame, depth_m, self._orb, detections)
+        return replace(
+            prepared,
+            flow_prev_to_curr_px=flow_px,
+            flow_is_given=self._flow.is_given,
+            timings_ms=spent,
+        )
 
     def static_map(self) -> StaticMap:
         """The sparse static map as it stands, copied."""
@@ -163,6 +172,40 @@ class DyObSlam:
             np.empty(0, np.int64),
         )
 
+    def _predict(self, view: View) -> Array:
+        """T_world_camera (4, 4) as expected for a view."""
+        motion = self._tracker.motion
+        return np.eye(4) if motion is None else motion.predict(view.timestamp_s)
+
+    @property
+    def _dilation_px(self) -> int:
+        return self.config.orb.mask_dilation_px
+
+    def _labels_that_move(self, objects: ObjectFrame, view: View) -> NDArray[np.int32]:
+        """(H, W) pixels that the camera must not rely on: objects, but for what stands still.
+
+        What has stood still may drive off at any time, so it serves only where it is needed.
+        """
+        column, row = np.rint(view.features.uv_px).astype(np.int64).T
+        off_objects = np.mean(objects.labels[row, column] == 0) if len(row) else 1.0
+        if off_objects >= self.config.objects.landmarks_below:
+            return objects.labels
+        landmarks = self._objects.landmark_ids(view.timestamp_s)
+        return np.where(np.isin(objects.labels, landmarks), 0, objects.labels).astype(np.int32)
+
+    def _forget_landmarks(self, view: View, tracked: TrackedFrame, objects: ObjectFrame) -> None:
+        """Parked cars that drive off take their points of the map with them."""
+        before, self._landmarks = (
+            self._landmarks,
+            set(self._objects.landmark_ids(view.timestamp_s)),
+        )
+        gone = [i for i in before - self._landmarks if i in objects.windows]
+        if not gone or tracked.status is not TrackingStatus.OK:
+            return
+        ids, uv = self.map.local_points(tracked.T_world_camera, np.empty(0, np.int64))
+        column, row = np.rint(uv).astype(np.int64).T
+        self.map.remove_points(ids[np.isin(objects.labels[row, column], gone)])
+
     def _grow_map(self, view: View, tracked: TrackedFrame) -> bool:
         """Whether the frame became a keyframe; LOST ones leave the map alone."""
         if tracked.status is not TrackingStatus.OK:
@@ -173,7 +216,14 @@ class DyObSlam:
 
     # ---------------------------------------------------------------- answers
 
-    def _result(self, frame: Frame, tracked: TrackedFrame, is_keyframe: bool) -> FrameResult:
+    def _result(
+        self,
+        frame: Frame,
+        tracked: TrackedFrame,
+        is_keyframe: bool,
+        estimates: ObjectEstimates,
+        objects: ObjectFrame,
+    ) -> FrameResult:
         return FrameResult(
             frame.index,
             frame.timestamp_s,
@@ -186,26 +236,23 @@ class DyObSlam:
             tracked.tracks.point_ids,
             tracked.inliers,
             tracked.rmse_px,
-            timings_ms=self._timings_ms,
+            estimates,
+            objects.labels if len(estimates) else None,
+            self._timings_ms,
         )
 
-    @contextmanager
-    def _stage(self, name: str) -> Iterator[None]:
-        begin = time.perf_counter()
-        try:
-            yield
-        finally:
-            spent = 1e3 * (time.perf_counter() - begin)
-            self._timings_ms[name] = self._timings_ms.get(name, 0.0) + spent
+    def _stage(self, name: str) -> AbstractContextManager[None]:
+        return timed(self._timings_ms, name)
 
 
-def detections(frame):
-    labels = frame.instance_labels
-    if labels is None:
-        return Detections.empty(frame.image.shape)
-    ids = np.flatnonzero(np.bincount(labels.ravel()))
-    ids = ids[ids > 0].astype(np.int32)
-    return Detections(labels, ids, np.full(len(ids), "object", "U16"), np.ones(len(ids)))
+@contextmanager
+def timed(spent_ms: dict[str, float], name: str) -> Iterator[None]:
+    """Add the time of the block, in ms, to what was spent under its name."""
+    begin = time.perf_counter()
+    try:
+        yield
+    finally:
+        spent_ms[name] = spent_ms.get(name, 0.0) + 1e3 * (time.perf_counter() - begin)
 
 
 def _check_size(camera: StereoCamera, frame: Frame) -> None:

@@ -142,8 +142,7 @@ def _load_flow(name: str, config: FlowConfig) -> Any:
     """The flow method of a run; the one place that knows how it is asked for."""
     from pipelines.flow import load_flow
 
-    options = {"preset": config.preset, "check": config.check, "max_miss_px": config.max_miss_px}
-    return load_flow(name, **(options if name == "dis" else {}))
+    return load_flow(replace(config, name=name))
 
 
 def _seen(name: str, frame: Frame) -> Any:

@@ -87,7 +87,7 @@ def run(
         for sink in sinks:
             sink.start(sequence, len(indices), config, folder)
         try:
-            _process_all(sequence, slam, indices, stride, sinks, progress)
+            _process_all(sequence, slam, indices, sinks, progress)
         except KeyboardInterrupt:
             _note_interruption(progress)
         except Exception:
@@ -130,11 +130,9 @@ def _process_all(
     sequence: Sequence,
     slam: DyObSlam,
     indices: range,
-    stride: int,
     sinks: tuple[Sink, ...],
     progress: _Progress,
 ) -> None:
-    previous: int | None = None
     begin = time.perf_counter()
     for index, pending in _prepare_ahead(sequence, slam, indices):
         try:
@@ -143,15 +141,11 @@ def _process_all(
             progress.skipped += 1
             _log.warning("frame %d skipped: %s", index, error)
             continue
-        if stride != 1 or previous != index - 1:  # the flow starts at a frame that was not seen
-            frame = replace(prepared.frame, flow_prev_to_curr_px=None)
-            prepared = replace(prepared, frame=frame)
-        previous = index
         result = slam.process(prepared)
         end = time.perf_counter()
         result.timings_ms["wall"] = 1e3 * (end - begin)
         begin = end
-        progress.results.append(result)
+        progress.results.append(replace(result, object_labels=None))  # a megabyte a frame
         _log.info(
             "frame %d %s by %s, %d inliers of %d%s, %.1f ms",
             index,

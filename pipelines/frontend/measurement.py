@@ -87,9 +87,10 @@ def measure_points(
 def _places_by_flow(last: LastFrame, view: View) -> Array:
     """Places (N, 2) that the given flow says, NaN where there is none."""
     uv = last.tracks.uv_px
-    if view.flow_prev_to_curr_px is None or not last.flow_starts_here or len(uv) == 0:
+    flow = view.flow_prev_to_curr_px if view.flow_is_given else None
+    if flow is None or not last.flow_starts_here or len(uv) == 0:
         return np.full((len(uv), 2), np.nan)
-    return uv + sample_bilinear(view.flow_prev_to_curr_px, uv)
+    return uv + sample_bilinear(flow, uv)
 
 
 def _places_to_start(

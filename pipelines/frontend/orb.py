@@ -37,22 +37,20 @@ class OrbExtractor:
         )
 
     def extract(self, gray: Image, static: NDArray[np.bool_] | None = None) -> Features:
-        """ORB features of a grey image (H, W), on pixels where `static` (H, W) is True.
+        """ORB features of a grey image (H, W): the strongest of each image cell.
 
-        Depths are left unknown (NaN). At most `n_features`, the strongest of each image cell.
+        static: (H, W) bool. About `n_features` lie where it is True, and as many more as the rest
+        of the image has room for at the same density: a thing that turns out to stand still is a
+        landmark, too. Depths are left unknown (NaN).
         """
         self._orb.setNLevels(self._levels_that_fit(gray.shape))
         corners = self._orb.detect(gray, None)  # masking afterwards is faster
         if not corners:
             return Features.empty()
         uv = cv2.KeyPoint_convert(corners).astype(np.float64)
-        candidates = np.arange(len(corners))
-        if static is not None:
-            column, row = np.rint(uv).astype(np.int64).T
-            candidates = np.flatnonzero(static[row, column])
-        response = np.array([corner.response for corner in corners])[candidates]
-        kept = spread_evenly(uv[candidates], response, gray.shape[:2], self.config.n_features)
-        keypoints, descriptors = self._orb.compute(gray, [corners[i] for i in candidates[kept]])
+        response = np.array([corner.response for corner in corners])
+        kept = self._spread(uv, response, gray.shape[:2], static)
+        keypoints, descriptors = self._orb.compute(gray, [corners[i] for i in kept])
         if descriptors is None or not keypoints:
             return Features.empty()
         table = np.array([(*k.pt, k.octave, k.angle, k.response) for k in keypoints])
@@ -65,6 +63,28 @@ class OrbExtractor:
             np.full(len(keypoints), np.nan),
         )
 
+    def _spread(
+        self,
+        uv_px: Array,
+        response: Array,
+        shape: tuple[int, int],
+        static: NDArray[np.bool_] | None,
+    ) -> NDArray[np.int64]:
+        """Indices of the corners to keep, of the static part and of the rest."""
+        n_wanted = self.config.n_features
+        if static is None:
+            return spread_evenly(uv_px, response, shape, n_wanted)
+        column, row = np.rint(uv_px).astype(np.int64).T
+        is_static = static[row, column]
+        share = float(static.mean())
+        parts = []
+        for part, n in ((is_static, n_wanted), (~is_static, _share_of_rest(n_wanted, share))):
+            candidates = np.flatnonzero(part)
+            parts.append(
+                candidates[spread_evenly(uv_px[candidates], response[candidates], shape, n)]
+            )
+        return np.sort(np.concatenate(parts))
+
     def _levels_that_fit(self, shape: tuple[int, ...]) -> int:
         """Levels on which something of an image (H, W) is left between the borders, one at least.
 
@@ -73,6 +93,11 @@ class OrbExtractor:
         shrinkage = min(shape) / (2 * _BORDER_PX + 1)
         fitting = 1 + int(np.log(max(shrinkage, 1.0)) / np.log(self.config.scale_factor))
         return min(self.config.n_levels, fitting)
+
+
+def _share_of_rest(n_wanted: int, static_share: float) -> int:
+    """How many corners the rest of an image gets, when its static share gets `n_wanted`."""
+    return int(n_wanted * min(1.0, (1.0 - static_share) / max(static_share, 1e-3)))
 
 
 def spread_evenly(

@@ -6,7 +6,7 @@ that needs what was learned of the sensor. Knows no poses.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipelines.depth import to_gray
 from pipelines.frontend.orb import OrbExtractor
 from pipelines.frontend.sampling import sample_disparity
+from pipelines.object_types import Detections
 from pipelines.types import Array, Features, Frame, Image, StereoCamera
 
 _CONTRAST_WINDOW_PX = 31  # neighbourhood that the corner detector's contrast is measured against
@@ -29,7 +30,7 @@ class View:
     image: as in `Frame`. gray: (H, W) uint8. disparity_px: (H, W) float32, corrected by the learned
     offset, NaN where unknown. static: (H, W) bool, False on movable objects and around them.
     features: ORB on static pixels, with depth in m. flow_prev_to_curr_px: (H, W, 2) on the previous
-    frame's pixels, or None.
+    frame's pixels, or None; flow_is_given: whether it came with the sequence.
     """
 
     frame_index: int
@@ -40,6 +41,16 @@ class View:
     static: NDArray[np.bool_]
     features: Features
     flow_prev_to_curr_px: NDArray[np.float32] | None
+    flow_is_given: bool = False
+
+    def masked(self, labels: NDArray[np.int32], dilation_px: int) -> View:
+        """The view without what lies on objects: labels (H, W), 0 where nothing moves.
+
+        Masks grow by `dilation_px`; features on them are left out.
+        """
+        static = static_pixels(labels, self.gray.shape, dilation_px)
+        column, row = np.rint(self.features.uv_px).astype(np.int64).T
+        return replace(self, static=static, features=self.features[static[row, column]])
 
     def is_static(self, uv_px: Array) -> NDArray[np.bool_]:
         """Whether pixels (N, 2) lie in the image and off movable objects."""
@@ -92,22 +103,30 @@ def normalise_contrast(gray: Image) -> Image:
 class PreparedFrame:
     """What can be said of a frame before anything is known of its pose, or of the sensor's errors.
 
-    gray: (H, W) uint8. disparity_px: (H, W) float32 as measured, NaN where unknown. static: (H, W)
-    bool. features: ORB on static pixels, without depth. timings_ms: wall time of each stage so far.
+    gray: (H, W) uint8. disparity_px: (H, W) float32 as measured, NaN where unknown. features: ORB,
+    without depth. detections: masks of movable things, None where there is no answer for this
+    frame. flow_prev_to_curr_px: (H, W, 2) from the frame prepared before, or None; flow_is_given:
+    whether it came with the sequence. timings_ms: wall time of each stage so far.
     """
 
     frame: Frame
     gray: Image
     disparity_px: NDArray[np.float32]
-    static: NDArray[np.bool_]
     features: Features
+    detections: Detections | None = None
+    flow_prev_to_curr_px: NDArray[np.float32] | None = None
+    flow_is_given: bool = False
     timings_ms: dict[str, float] = field(default_factory=dict)
 
 
 def prepare_frame(
-    camera: StereoCamera, frame: Frame, depth_m: NDArray[np.float32] | None, orb: OrbExtractor
+    camera: StereoCamera,
+    frame: Frame,
+    depth_m: NDArray[np.float32] | None,
+    orb: OrbExtractor,
+    detections: Detections | None = None,
 ) -> PreparedFrame:
-    """Grey image, disparities, static pixels and features of a frame with depth (H, W) in m."""
+    """Grey image, disparities and features of a frame with depth (H, W) in m."""
     gray = to_gray(frame.image)
     if depth_m is None:
         disparity = np.full(gray.shape, np.nan, np.float32)
@@ -115,9 +134,10 @@ def prepare_frame(
         with np.errstate(divide="ignore", invalid="ignore"):
             disparity = np.where(depth_m > 0, np.float32(camera.bf) / depth_m, np.float32(np.nan))
         disparity = disparity.astype(np.float32, copy=False)
-    static = static_pixels(frame.instance_labels, gray.shape, orb.config.mask_dilation_px)
+    labels = None if detections is None else detections.labels
+    static = static_pixels(labels, gray.shape, orb.config.mask_dilation_px)
     features = orb.extract(normalise_contrast(gray), static)
-    return PreparedFrame(frame, gray, disparity, static, features)
+    return PreparedFrame(frame, gray, disparity, features, detections)
 
 
 def complete_view(
@@ -128,7 +148,8 @@ def complete_view(
 ) -> View:
     """The view of a prepared frame, by what is known of the sensor's disparities now.
 
-    sigma_disparity_px: their noise. disparity_offset_px: true minus measured.
+    sigma_disparity_px: their noise. disparity_offset_px: true minus measured. Everything counts as
+    static so far; see `View.masked`.
     Deviation: the paper matches ORB features of both images for their depth; here it is read off
     the dense disparities, which serves stereo and RGB-D alike.
     """
@@ -145,7 +166,8 @@ def complete_view(
         frame.image,
         prepared.gray,
         disparity,
-        prepared.static,
+        np.ones(prepared.gray.shape, bool),
         features,
-        frame.flow_prev_to_curr_px,
+        prepared.flow_prev_to_curr_px,
+        prepared.flow_is_given,
     )

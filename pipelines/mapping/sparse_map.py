@@ -136,10 +136,7 @@ class SparseMap:
         self.n_found[found_ids] += 1
 
     def cull_points(self, tracked_ids: Ids, visible_ids: Ids) -> None:
-        """Forget points that proved no good: lost while young, or mostly not found where visible.
-
-        Points that no keyframe saw free their rows; others only die, as keyframes name them.
-        """
+        """Forget points that proved no good: lost while young, or mostly not found where visible."""
         tracked = np.zeros(self._size, bool)
         tracked[tracked_ids] = True
         self._young = self._young[self.n_keyframes[self._young] == 0]
@@ -148,7 +145,14 @@ class SparseMap:
         broken = tracked_ids[~np.isfinite(self.position_m[tracked_ids]).all(axis=1)]
         doomed = np.concatenate([self._young, visible_ids[poor]])
         doomed = np.unique(np.concatenate([doomed[~tracked[doomed]], broken]))
-        doomed = doomed[self.alive[doomed]]
+        self.remove_points(doomed)
+
+    def remove_points(self, ids: Ids) -> None:
+        """Forget points, each named once.
+
+        Points that no keyframe saw free their rows; others only die, as keyframes name them.
+        """
+        doomed = ids[self.alive[ids]]
         self.alive[doomed] = False
         self._young = self._young[self.alive[self._young]]
         self._free = np.concatenate([self._free, doomed[self.n_keyframes[doomed] == 0]])

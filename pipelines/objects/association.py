@@ -19,7 +19,7 @@ from pipelines.types import Array
 _MIN_VOTES = 0.3  # share of an object's points that a detection must hold
 _FEW_POINTS = 5  # fewer votes say little, boxes then count as well
 _MIN_OVERLAP = 0.2  # intersection over union with the predicted box, where points are few
-_GATE = 9.3  # chi-square, 3 degrees of freedom, 97.5 %
+_GATE = 16.3  # chi-square, 3 degrees of freedom, 99.9 %
 _UNLIKELY = 20.0  # of distance2 + log_spread, where only the colour still counts
 _MAX_COLOR_DISTANCE = 0.6  # Hellinger, of something found again
 _NO_MATCH = 2.0  # what it costs to leave an object without a detection: more than any match

@@ -39,6 +39,12 @@ class Followed:
         return Followed(*(getattr(self, f.name)[which] for f in fields(self)))
 
     @classmethod
+    def empty(cls) -> Followed:
+        """No points at all."""
+        two = np.empty((0, 2))
+        return cls(two, np.empty(0, bool), np.empty(0), two, two)
+
+    @classmethod
     def concatenate(cls, *parts: Followed) -> Followed:
         """All parts, in their order."""
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))

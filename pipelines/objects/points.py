@@ -59,6 +59,7 @@ class ObjectPoints:
     @classmethod
     def concatenate(cls, *parts: ObjectPoints) -> ObjectPoints:
         """All parts, sorted by object."""
+        parts = parts or (cls.empty(),)
         joined = cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
         return joined[np.argsort(joined.object_id, kind="stable")]
 
@@ -102,8 +103,8 @@ def choose_pixels(
     rows, columns = -(-h // cell_px), -(-w // cell_px)
     padded = np.zeros((rows * cell_px, columns * cell_px), np.float32)
     padded[:h, :w] = quality
-    cells = padded.reshape(rows, cell_px, columns, cell_px).transpose(0, 2, 1, 3)
-    cells = cells.reshape(rows * columns, cell_px * cell_px)
+    tiles = padded.reshape(rows, cell_px, columns, cell_px).transpose(0, 2, 1, 3)
+    cells = tiles.reshape(rows * columns, cell_px * cell_px)
     best = cells.argmax(1)
     score = cells[np.arange(len(cells)), best]
     v0, u0 = window[0].start, window[1].start

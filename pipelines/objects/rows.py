@@ -37,11 +37,6 @@ class RowTable:
     ) -> None:
         """One object as it is now. center_m: (3,) in the world, NaN where it has no depth."""
         T = track.T_world_object
-        velocity = np.full(3, np.nan)
-        if track.filter is not None:
-            velocity = track.filter.velocity_mps
-            if T is not None and np.isfinite(center_m).all():
-                velocity = velocity + np.cross(track.filter.turn_radps, center_m - T[:3, 3])
         self._rows.append(
             {
                 "object_id": track.object_id,
@@ -58,7 +53,7 @@ class RowTable:
                 "center": center_m,
                 "speed": speed_mps,
                 "speed_std": speed_std_mps,
-                "velocity": velocity,
+                "velocity": track.velocity_at(center_m),
                 "velocity_std": np.nan if track.filter is None else track.filter.speed_std_mps,
                 "extent": track.extent_m,
             }

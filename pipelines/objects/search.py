@@ -44,9 +44,8 @@ def _describe(
     """ORB corners (N, 2) of the whole image's pixels in the mask, and their descriptors (N, 32)."""
     rows, columns = window
     top, left = max(rows.start - _BORDER_PX, 0), max(columns.start - _BORDER_PX, 0)
-    part = np.ascontiguousarray(
-        gray[top : rows.stop + _BORDER_PX, left : columns.stop + _BORDER_PX]
-    )
+    bottom, right = rows.stop + _BORDER_PX, columns.stop + _BORDER_PX
+    part = np.ascontiguousarray(gray[top:bottom, left:right])
     inner = np.zeros(part.shape, np.uint8)
     inner[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = mask
     orb = cv2.ORB_create(
@@ -58,5 +57,4 @@ def _describe(
     corners, descriptors = orb.detectAndCompute(part, inner)
     if descriptors is None or not corners:
         return np.empty((0, 2)), np.empty((0, 32), np.uint8)
-    uv = cv2.KeyPoint_convert(corners).astype(np.float64) + (left, top)
-    return uv, descriptors
+    return cv2.KeyPoint_convert(corners) + np.array([left, top], float), descriptors

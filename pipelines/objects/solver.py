@@ -40,10 +40,10 @@ class Solution:
     motions: Motions
     accepted: NDArray[np.bool_]
 
-    def rows_of(self, j: int) -> slice:
-        """Where the points of object `j` are."""
+    def rows_of(self, j: int) -> NDArray[np.int64]:
+        """Rows of the points of object `j`."""
         end = int(self.motions.n_points[: j + 1].sum())
-        return slice(end - int(self.motions.n_points[j]), end)
+        return np.arange(end - int(self.motions.n_points[j]), end)
 
 
 class MotionSolver:

@@ -1,6 +1,7 @@
 """One object over time: identity, class, pose, filter and state.
 
-Owns what is remembered of an object between frames, and its prediction. Measures nothing.
+Owns what is remembered of an object between frames, how it is predicted, and how a measured motion
+changes it. Measures nothing.
 """
 
 from __future__ import annotations
@@ -10,7 +11,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipelines.geometry import make_T, transform_points
+from pipelines.config import ObjectsConfig
+from pipelines.geometry import (
+    invert_T,
+    make_T,
+    orthonormalise,
+    rotation_vector,
+    skew,
+    transform_points,
+)
 from pipelines.object_types import UNNAMED_CLASS, ObjectState
 from pipelines.objects.kalman import ObjectFilter
 from pipelines.objects.motion import scale_about
@@ -19,19 +28,28 @@ from pipelines.types import Array
 _COLOR_MEMORY = 0.8  # share of the old colours that each frame keeps
 _EXTENT_PERCENTILES = (4.0, 96.0)  # of the points, so that a stray one does not blow up the box
 _GROWTH = 0.3  # of the way to them by which the box grows in a frame, for the same reason
+_SEEN_SIGMA_M = 1.0  # the middle of a mask, at its median depth
+_PART_SHARE = 0.35  # of its size, the same where a part of it may be hidden
+_SHRINKING = 0.98  # share of its size that it keeps from frame to frame at least
+_MAX_SLIP_S = 0.5  # s without a measured motion after which nobody knows where its box is
+_CENTER_SIGMA_M = 0.3  # the filter's centre is held this loosely: its model is not the matter's
+_FASTEST_RADPS, _FASTEST_MPS = 2.0, 20.0  # standard deviations of motions not yet known
 
 
 @dataclass(slots=True)
 class ObjectTrack:
     """An object that is in sight, or was not long ago.
 
-    filter, T_world_object: None until something of it has a depth. H_world_curr_prev: last measured
-    motion, over `H_dt_s`, with covariance (6, 6); None where the last frame measured none. seen_s, detected_s: when its
-    points or mask, and when a detection, were last in view. still_since_s: None unless stopped.
-    box_px, area_px, color: of its last mask. low_m, high_m: (3,) box around its points, along the axes of T_world_object.
+    filter, T_world_object: None until something of it has a depth; the filter follows the origin
+    of the pose. H_world_curr_prev: last measured motion, over `H_dt_s`, with covariance (6, 6);
+    None where the last frame measured none. seen_s: when it was last in view. missed_s: for how
+    long detections have gone without it. still_since_s: None unless stopped. box_px, area_px,
+    color: of its last mask. low_m, high_m: (3,) box around its points in the axes of its pose, NaN
+    where the pose was not measured; extent_m: (3,) its size, also after that.
     """
 
     object_id: int
+    config: ObjectsConfig
     state: ObjectState = ObjectState.UNKNOWN
     scores: dict[str, float] = field(default_factory=dict)
     filter: ObjectFilter | None = None
@@ -40,24 +58,23 @@ class ObjectTrack:
     H_dt_s: float = 0.0
     H_covariance: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
     seen_s: float = 0.0
-    detected_s: float = 0.0
+    missed_s: float = 0.0
+    unmeasured_s: float = 0.0
     still_since_s: float | None = None
     box_px: Array = field(default_factory=lambda: np.full(4, np.nan))
     area_px: int = 0
     color: Array = field(default_factory=lambda: np.zeros(64))
     low_m: Array = field(default_factory=lambda: np.full(3, np.nan))
     high_m: Array = field(default_factory=lambda: np.full(3, np.nan))
+    extent_m: Array = field(default_factory=lambda: np.full(3, np.nan))
+
+    # ---------------------------------------------------------------- answers
 
     @property
     def class_name(self) -> str:
         """The class with the highest sum of scores so far; a name wins over none."""
         named = {name: score for name, score in self.scores.items() if name != UNNAMED_CLASS}
         return max(named or {UNNAMED_CLASS: 0.0}, key=lambda name: (named.get(name, 0.0), name))
-
-    @property
-    def extent_m(self) -> Array:
-        """(3,) size of the box around its points, NaN before there are any."""
-        return self.high_m - self.low_m
 
     @property
     def box_center_m(self) -> Array | None:
@@ -67,12 +84,19 @@ class ObjectTrack:
         middle = 0.5 * (self.low_m + self.high_m)
         return self.T_world_object[:3, :3] @ middle + self.T_world_object[:3, 3]
 
-    def take_detection(self, name: str, score: float, color: Array, timestamp_s: float) -> None:
-        """Take in what a detection says of its class and colours (64,)."""
-        self.scores[name] = self.scores.get(name, 0.0) + max(score, 1e-3)
-        share = _COLOR_MEMORY if self.color.any() else 0.0
-        self.color = share * self.color + (1.0 - share) * color
-        self.detected_s = timestamp_s
+    def velocity_at(self, point_m: Array) -> Array:
+        """(3,) m/s of the object's matter at a point (3,) in the world, by the filter."""
+        if self.filter is None:
+            return np.full(3, np.nan)
+        velocity = self.filter.velocity_mps
+        if np.isfinite(point_m).all():
+            velocity = velocity + np.cross(self.filter.turn_radps, point_m - self.filter.center_m)
+        return velocity
+
+    def is_landmark(self, timestamp_s: float) -> bool:
+        """Whether it has been still for so long that it serves the camera as the world does."""
+        since = self.still_since_s
+        return since is not None and timestamp_s - since >= self.config.still_after_s
 
     def predicted_motion(self, dt_s: float) -> Array:
         """H (4, 4) over the next `dt_s`: the last motion goes on, else what the filter says."""
@@ -83,6 +107,83 @@ class ObjectTrack:
             return scale_about(self.H_world_curr_prev, center, dt_s / self.H_dt_s)
         R = Rotation.from_rotvec(self.filter.turn_radps * dt_s).as_matrix()
         return make_T(R, center + self.filter.velocity_mps * dt_s - R @ center)
+
+    def expected_motion(self, center_m: Array, dt_s: float) -> tuple[Array, Array]:
+        """What motion (4, 4) to expect in a time, with covariance (6, 6), before it is measured.
+
+        The last one, changed by what objects can do in the time; of a new object, none, give or
+        take the fastest that there is. center_m: (3,) what the covariance is about.
+        """
+        if self.H_world_curr_prev is None:
+            std = np.repeat([_FASTEST_RADPS, _FASTEST_MPS], 3) * dt_s
+            return np.eye(4), np.diag(std**2)
+        share = dt_s / self.H_dt_s
+        std = np.repeat([self.config.turn_radps2, self.config.acceleration_mps2], 3)
+        std *= dt_s * 0.5 * (dt_s + self.H_dt_s)
+        expected = scale_about(self.H_world_curr_prev, center_m, share)
+        return expected, self.H_covariance * share**2 + np.diag(std**2)
+
+    # ---------------------------------------------------------------- changes
+
+    def take_detection(self, name: str, score: float, color: Array) -> None:
+        """Take in what a detection says of its class and colours (64,)."""
+        self.scores[name] = self.scores.get(name, 0.0) + max(score, 1e-3)
+        share = _COLOR_MEMORY if self.color.any() else 0.0
+        self.color = share * self.color + (1.0 - share) * color
+        self.missed_s = 0.0
+
+    def take_motion(self, H: Array, covariance: Array, center_m: Array, dt_s: float) -> None:
+        """Take a measured motion (4, 4) into filter and pose. covariance: about the centre (3,)."""
+        if self.T_world_object is None:
+            self.T_world_object = invert_T(H) @ make_T(np.eye(3), center_m)
+        before = self.T_world_object[:3, 3]
+        self.T_world_object = orthonormalise(H @ self.T_world_object)
+        origin = self.T_world_object[:3, 3].copy()
+        A = np.eye(6)
+        A[3:, :3] = -skew(origin - center_m)
+        covariance_m2 = (A @ covariance @ A.T)[3:, 3:]
+        loose = covariance_m2 + _CENTER_SIGMA_M**2 * np.eye(3)
+        if self.filter is None:
+            self.filter = ObjectFilter(origin, loose, self.config.acceleration_mps2)
+        self.filter.update_motion(
+            origin, loose, (origin - before) / dt_s, covariance_m2 / dt_s**2,
+            rotation_vector(H) / dt_s,
+        )  # fmt: skip
+        self.H_world_curr_prev, self.H_dt_s, self.H_covariance = H, dt_s, covariance
+        self.unmeasured_s = 0.0
+
+    @property
+    def center_sigma_m(self) -> float:
+        """How far the middle of what is seen of it may be off: any part of it may be hidden."""
+        return max(_SEEN_SIGMA_M, _PART_SHARE * float(np.nan_to_num(self.extent_m).max()))
+
+    def take_center(self, center_m: Array) -> None:
+        """Take in where the middle (3,) of what is seen of it lies, where there is no motion."""
+        covariance = self.center_sigma_m**2 * np.eye(3)
+        if self.filter is None or self.T_world_object is None:
+            self.filter = ObjectFilter(center_m, covariance, self.config.acceleration_mps2)
+            self.T_world_object = make_T(np.eye(3), center_m)
+            return
+        self.filter.update_center(center_m, covariance)
+        self._follow_filter()
+
+    def coast(self, dt_s: float) -> None:
+        """Go on without a measured motion; the filter has been moved on already."""
+        if self.T_world_object is not None and self.filter is not None:
+            self.T_world_object = self.predicted_motion(dt_s) @ self.T_world_object
+            self._follow_filter()
+        self.H_world_curr_prev = None
+        self.unmeasured_s += dt_s
+        if self.unmeasured_s > _MAX_SLIP_S:
+            self.low_m, self.high_m = np.full(3, np.nan), np.full(3, np.nan)
+
+    def _follow_filter(self) -> None:
+        """Put the pose's origin where the filter has it; the box stays with the matter."""
+        assert self.filter is not None and self.T_world_object is not None
+        slip_m = self.filter.center_m - self.T_world_object[:3, 3]
+        self.T_world_object[:3, 3] += slip_m
+        shift = self.T_world_object[:3, :3].T @ slip_m
+        self.low_m, self.high_m = self.low_m - shift, self.high_m - shift
 
     def set_state(self, state: ObjectState, timestamp_s: float) -> None:
         """Change the state; a stopped object remembers since when it is."""
@@ -95,10 +196,10 @@ class ObjectTrack:
     def take_points(self, points_world_m: Array) -> None:
         """Widen the box by the points (N, 3) seen now."""
         assert self.T_world_object is not None
-        R, t = self.T_world_object[:3, :3], self.T_world_object[:3, 3]
-        local = transform_points(make_T(R.T, -R.T @ t), points_world_m)
+        local = transform_points(invert_T(self.T_world_object), points_world_m)
         low, high = np.percentile(local, _EXTENT_PERCENTILES, axis=0)
         if np.isnan(self.low_m).any():
             self.low_m, self.high_m = low, high
         self.low_m = self.low_m + _GROWTH * np.minimum(low - self.low_m, 0.0)
         self.high_m = self.high_m + _GROWTH * np.maximum(high - self.high_m, 0.0)
+        self.extent_m = np.fmax(self.high_m - self.low_m, _SHRINKING * self.extent_m)

@@ -1,0 +1,80 @@
+"""Points of objects in the previous image that were not tracked there: of new ones, and of lost.
+
+Owns the two ways back: along the flow for what is detected for the first time, by descriptors for
+what moved too far for the flow. Keeps nothing.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.frontend.view import View
+from pipelines.objects.frame import LastObjects, ObjectFrame
+from pipelines.objects.points import choose_pixels
+from pipelines.objects.search import match_masks
+from pipelines.objects.solver import MotionSolver
+from pipelines.types import Array
+
+_GRID_PX = 3  # on the previous image, which is searched for a new object's pixels
+_SHY_NODES = 5  # nodes, side of the square by which a seed keeps off other objects
+_MIN_SEARCH_PX = 400  # an object of fewer pixels has too few corners to be found by them
+
+
+def seed_pixels(
+    last: LastObjects, frame: ObjectFrame, flow_px: NDArray[np.float32], n_each: int
+) -> tuple[NDArray[np.int64], Array]:
+    """Pixels of the previous image that belong to the frame's new objects: ids (N,), pixels (N, 2).
+
+    A new object was there before it was detected: the flow (H, W, 2) says which pixels lead into
+    its mask, so that it has a motion in its very first frame. What stood before it or beside it
+    then is left out.
+    """
+    H, W = flow_px.shape[:2]
+    v, u = np.mgrid[0:H:_GRID_PX, 0:W:_GRID_PX]
+    to = np.nan_to_num(flow_px[::_GRID_PX, ::_GRID_PX], nan=1e6)
+    x, y = np.rint(u + to[..., 0]).astype(np.int64), np.rint(v + to[..., 1]).astype(np.int64)
+    inside = (x >= 0) & (y >= 0) & (x < W) & (y < H)
+    label = np.where(inside, frame.labels[np.clip(y, 0, H - 1), np.clip(x, 0, W - 1)], 0)
+    before = last.labels[::_GRID_PX, ::_GRID_PX].astype(np.float32)
+    before = cv2.dilate(before, np.ones((_SHY_NODES, _SHY_NODES), np.uint8))
+    label[(before > 0) & (before != label)] = 0
+    pixels = [_pixels_on_grid(last.view, label == i, n_each) for i in frame.new_ids]
+    ids = np.repeat(np.array(frame.new_ids, np.int64), [len(p) for p in pixels])
+    return ids, np.concatenate([np.empty((0, 2)), *pixels])
+
+
+def _pixels_on_grid(view: View, on_grid: NDArray[np.bool_], n: int) -> Array:
+    """Pixels (N, 2) of a view for points of an object that covers these nodes of the grid."""
+    rows, columns = np.flatnonzero(on_grid.any(1)), np.flatnonzero(on_grid.any(0))
+    if len(rows) == 0:
+        return np.empty((0, 2))
+    part = on_grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    mask = np.repeat(np.repeat(part, _GRID_PX, axis=0), _GRID_PX, axis=1)
+    H, W = view.gray.shape
+    y0, x0 = int(rows[0]) * _GRID_PX, int(columns[0]) * _GRID_PX
+    mask = mask[: H - y0, : W - x0]
+    window = (slice(y0, y0 + mask.shape[0]), slice(x0, x0 + mask.shape[1]))
+    return choose_pixels(view.gray, mask, window, n, np.empty((0, 2)))
+
+
+def guess_motions(
+    solver: MotionSolver, last: LastObjects, view: View, frame: ObjectFrame, solved: set[int]
+) -> dict[int, Array]:
+    """Motions G (4, 4) by id, by descriptors, of detected objects that are not among the solved."""
+    guesses: dict[int, Array] = {}
+    for object_id in frame.windows:
+        before = last.mask(object_id)
+        if object_id in solved or before is None or frame.scores[object_id] == 0.0:
+            continue
+        mask = frame.mask(object_id)
+        if min(np.count_nonzero(before[0]), np.count_nonzero(mask)) < _MIN_SEARCH_PX:
+            continue
+        uv_prev, uv = match_masks(
+            last.view.gray, *before, view.gray, mask, frame.windows[object_id]
+        )
+        G = solver.guess_by_matches(last.view.disparity_px, uv_prev, uv)
+        if G is not None:
+            guesses[object_id] = G
+    return guesses

@@ -1,0 +1,121 @@
+"""Steps 1 and 2 of a frame: instance masks and dense flow, by the methods that the settings name.
+
+Owns their choice, when the network runs, and what happens when it is late or fails: then a frame
+has no answer, and the object tracker carries the masks on. Knows no poses and no objects.
+"""
+
+from __future__ import annotations
+
+import logging
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as LateError
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import DetectorConfig, FlowConfig
+from pipelines.detection import Detector, choose_detector, load_detector
+from pipelines.errors import ConfigError, ModelError
+from pipelines.flow import Flow, choose_flow, load_flow
+from pipelines.object_types import Detections
+from pipelines.types import Frame
+
+_log = logging.getLogger("dyob.perception")
+
+
+class Segmentation:
+    """Asks the detector for the masks of frames; step 1.
+
+    name: of the method in use, known after the first frame: `auto` depends on what frames bring.
+    """
+
+    def __init__(self, config: DetectorConfig) -> None:
+        self.config = config
+        self.name = ""
+        self._detector: Detector | None = None
+        self._n_seen = 0
+        self._failures = 0
+        self._pool: ThreadPoolExecutor | None = None
+        self._late: Future[Detections] | None = None
+
+    def detect(self, frame: Frame) -> Detections | None:
+        """Masks of a frame, or None where there is no answer for it: not its turn, late, or failed.
+
+        Raises ModelError where the network's file is missing or damaged; other failures of a
+        network are a warning, as one bad frame must not end a run.
+        """
+        if self._detector is None:
+            self.name = choose_detector(self.config, frame.instance_labels is not None)
+            self._detector = load_detector(replace(self.config, name=self.name))
+        turn = self._n_seen % self.config.every_n == 0
+        self._n_seen += 1
+        if not turn:
+            return None
+        try:
+            return self._ask(self._detector, frame)
+        except (ModelError, ConfigError):
+            raise
+        except Exception as error:  # whatever a network may throw at one image
+            self._failures += 1
+            _log.warning(
+                "frame %d: the detector failed (%s: %s); masks are carried on by flow",
+                frame.index,
+                type(error).__name__,
+                error,
+            )
+            return None
+
+    def _ask(self, detector: Detector, frame: Frame) -> Detections | None:
+        if self.config.timeout_ms <= 0:
+            return detector.detect(frame)
+        if self._late is not None:
+            if not self._late.done():
+                return None  # still busy with an earlier frame
+            self._late.exception()  # an answer to a frame that has passed is of no use
+            self._late = None
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(1, thread_name_prefix="detector")
+        pending = self._pool.submit(detector.detect, frame)
+        try:
+            return pending.result(self.config.timeout_ms / 1e3)
+        except LateError:
+            self._late = pending
+            return None
+
+
+class DenseFlow:
+    """Dense optical flow from each frame to the next; step 2.
+
+    is_given: whether the last flow came with the sequence rather than being computed here.
+    """
+
+    def __init__(self, config: FlowConfig) -> None:
+        self.config = config
+        self.is_given = False
+        self._method: Flow | None = None
+        self._name = ""
+        self._fallback: Flow | None = None
+        self._previous: Frame | None = None
+
+    def compute(self, frame: Frame) -> NDArray[np.float32] | None:
+        """Flow (H, W, 2) from the frame before, on its grid; None for the first frame.
+
+        A flow that comes with the sequence starts at the frame with the index before; where that
+        is not the frame that was seen before, or the file is missing, `auto` computes it.
+        """
+        previous, self._previous = self._previous, frame
+        if previous is None:
+            return None
+        given = frame.flow_prev_to_curr_px if frame.index == previous.index + 1 else None
+        if self._method is None:
+            self._name = choose_flow(self.config, frame.flow_prev_to_curr_px is not None)
+            self._method = load_flow(replace(self.config, name=self._name), given is not None)
+        self.is_given = self._name == "files" and given is not None
+        if self._name == "files" and given is None:
+            if self.config.name == "files":
+                return None
+            if self._fallback is None:
+                self._fallback = load_flow(replace(self.config, name="dis"))
+            return self._fallback.compute(previous.image, frame.image)
+        return self._method.compute(previous.image, frame.image, given)
