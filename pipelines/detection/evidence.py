@@ -1,0 +1,222 @@
+"""What is known of each cell in one frame, and what that says of a set of cells.
+
+Owns how the depth test and the flow test add up: whether a region moves, how, and how far it goes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import GeometryConfig
+from pipelines.detection.cells import Bools, CellGrid, DepthCells, Floats
+from pipelines.detection.depth_test import Comparison
+from pipelines.detection.flow_test import FlowResiduals, smooth
+from pipelines.detection.masks import box_of
+from pipelines.detection.regions import RegionMotion, connect, favours_motion, fit_motion
+from pipelines.types import Array
+
+_HALF_SURE = 0.5  # strength of flow that counts where older views saw the place empty
+_MIN_INNER = 0.12  # share of a region's cells that have all neighbours in it: else it is a rim
+_LEFT_PLACE = 1.5  # of its own length: by then a moving thing, even one that gathers speed, has gone
+_MAX_STILL_SHARE = 0.5  # of a region that older views saw in the same place: it stands
+_GAP_FACTOR = 1.5  # parts of one thing may lie farther apart in depth than cells of one surface
+_STILL = 0.7  # strength of flow below which a cell counts as still
+_MAX_GOES_ON = 0.35  # share of the cells around that are still, and of the same surface
+_MAX_PART = 0.6  # of the size of the whole
+_PART_DEPTH_M = 1.5  # m, parts of one thing are no farther apart
+_PART_MOTION = 0.15  # share of a thing's motion that its turning gives parts of it
+_SURE_SIGMAS = 2.5  # of a region's motion beyond the least that counts
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """One frame's cells, all (h, w).
+
+    flow: residuals against the frame before, or None. comparisons: with older views. usable:
+    near enough, above the ground. dt_s: time since the frame before. sigma_px: of a cell's
+    disparity.
+    """
+
+    grid: CellGrid
+    cells: DepthCells
+    flow: FlowResiduals | None
+    comparisons: list[Comparison]
+    usable: Bools
+    dt_s: float
+    sigma_px: float
+    config: GeometryConfig
+
+    def moving_cells(self) -> Bools:
+        """Cells that move by themselves, before any region is looked at."""
+        empty = np.zeros(self.grid.shape, np.int32)
+        for comparison in self.comparisons:
+            empty += comparison.was_empty
+        was_empty = empty * 2 > len(self.comparisons) if self.comparisons else empty > 0
+        if self.flow is None:
+            return self.usable & was_empty
+        strength = smooth(self.flow.strength)
+        by_flow = (strength > 1) & self.flow.valid
+        # Slow things, and those whose flow cannot be read: only where older views saw through
+        by_depth = was_empty & np.where(self.flow.valid, strength > _HALF_SURE, True)
+        return self.usable & (by_flow | by_depth)
+
+    def components(self, moving: Bools) -> list[Bools]:
+        """Moving cells by connectedness in depth, the largest first; tiny ones left out."""
+        gap = self._gap_share() * _GAP_FACTOR
+        labels, count = connect(moving, self.cells.disparity_px, self.sigma_px, gap)
+        sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
+        order = np.argsort(-sizes, kind="stable")
+        return [labels == i + 1 for i in order if sizes[i] >= max(3, self.config.min_cells // 2)]
+
+    def motion_of(self, region: Bools) -> RegionMotion | None:
+        """How a region moves since the frame before; None without flow in it."""
+        if self.flow is None:
+            return None
+        which = np.flatnonzero(region & self.flow.valid)
+        flow = self.flow
+        return fit_motion(
+            self.grid, which, self.cells.disparity_px, flow.error_px, flow.sigma_px
+        )
+
+    def certainty(self, motion: RegionMotion) -> float:
+        """By how many standard deviations a motion exceeds the least that counts."""
+        size = float(np.linalg.norm(motion.translation_m))
+        if size < 1e-9:
+            return 0.0
+        direction = motion.translation_m / size
+        # Along the direction of motion, given that the other two are as found
+        sigma = 1 / np.sqrt(direction @ np.linalg.inv(motion.covariance_m2) @ direction)
+        return float((size - self.config.min_speed_mps * self.dt_s) / sigma)
+
+    def is_moving(self, region: Bools, motion: RegionMotion) -> bool:
+        """Whether a region moves as one, surely, and has not been seen to stand."""
+        return (
+            motion.agreement >= self.config.min_agreement
+            and self.certainty(motion) > _SURE_SIGMAS
+            and not self.stood(region, motion)
+        )
+
+    def score(self, motion: RegionMotion) -> float:
+        """How sure a region's motion is, 0 to 1."""
+        excess = max(self.certainty(motion), 0.0)
+        return motion.agreement * excess / (excess + _SURE_SIGMAS)
+
+    def is_part(
+        self, part: Bools, part_motion: RegionMotion, whole: Bools, motion: RegionMotion
+    ) -> bool:
+        """Whether a region is a smaller part of a thing: as near, and moving alike."""
+        if part.sum() > _MAX_PART * whole.sum():
+            return False
+        d = self.cells.disparity_px
+        a, b = float(np.nanmedian(d[part])), float(np.nanmedian(d[whole]))
+        bf = self.grid.camera.bf
+        if abs(bf / a - bf / b) > max(_PART_DEPTH_M, self.config.depth_gap_share * bf / b):
+            return False
+        apart = part_motion.translation_m - motion.translation_m
+        covariance = part_motion.covariance_m2 + motion.covariance_m2
+        slack = (_PART_MOTION * float(np.linalg.norm(motion.translation_m))) ** 2
+        return float(apart @ np.linalg.solve(covariance + slack * np.eye(3), apart)) < 9.0
+
+    def stood(self, region: Bools, motion: RegionMotion | None) -> bool:
+        """Whether older views saw the region where it is now, long enough ago to contradict.
+
+        Its motion, if any, must have led it away since: a thing that moved by less than its own
+        size covers its old place in part.
+        """
+        extent_m = 0.0 if motion is None else self._extent_along(region, motion.translation_m)
+        for comparison in self.comparisons:
+            if motion is not None:
+                away = float(np.linalg.norm(motion.translation_m)) * comparison.age_s / self.dt_s
+                if away < _LEFT_PLACE * extent_m:
+                    continue
+            agrees = int((comparison.agrees & region).sum())
+            seen = agrees + int((comparison.was_empty & region).sum())
+            if seen >= 0.3 * region.sum() and agrees > _MAX_STILL_SHARE * seen:
+                return True
+        return False
+
+    def _extent_along(self, region: Bools, direction_m: Array) -> float:
+        """Length in m of a region along a direction, without its outermost cells."""
+        which = np.flatnonzero(region & np.isfinite(self.cells.disparity_px))
+        depth = self.grid.camera.bf / self.cells.disparity_px.ravel()[which]
+        points = self.grid.rays[:, which] * depth
+        along = direction_m @ points / max(float(np.linalg.norm(direction_m)), 1e-9)
+        low, high = np.quantile(along, (0.05, 0.95))
+        return float(high - low)
+
+    def is_patch(self, region: Bools) -> bool:
+        """Whether a region is a piece of a still surface, that goes on beyond its border."""
+        if self.flow is None:
+            return False
+        kernel = np.ones((3, 3), np.uint8)
+        d = self.cells.disparity_px
+        box = box_of(region, 4)
+        inner = region[box]
+        outer = cv2.dilate(inner.astype(np.uint8), kernel, iterations=3) > 0
+        ring = outer & ~(cv2.dilate(inner.astype(np.uint8), kernel) > 0)
+        ring &= self.usable[box] & self.flow.valid[box] & (self.flow.strength[box] < _STILL)
+        weight = inner.astype(np.float32)
+        total = cv2.boxFilter(weight, -1, (9, 9), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        summed = cv2.boxFilter(
+            np.nan_to_num(d[box]) * weight, -1, (9, 9), normalize=False,
+            borderType=cv2.BORDER_CONSTANT,
+        )
+        inside = summed / np.maximum(total, np.float32(0.5))
+        gap = self.config.depth_gap_share * d[box] + 4 * self.sigma_px
+        goes_on = ring & (np.abs(inside - d[box]) < gap)
+        around = int((outer & ~(cv2.dilate(inner.astype(np.uint8), kernel) > 0)).sum())
+        return int(goes_on.sum()) > _MAX_GOES_ON * max(1, around)
+
+    def was_empty_share(self, region: Bools) -> float:
+        """Share of a region that any older view saw through."""
+        empty = np.zeros(self.grid.shape, bool)
+        for comparison in self.comparisons:
+            empty |= comparison.was_empty
+        return float((empty & region).sum() / max(1, region.sum()))
+
+    def is_rim(self, region: Bools) -> bool:
+        """Whether a region is hardly wider than the border of something."""
+        inner = cv2.erode(region.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1)
+        return int(inner.sum()) < max(1, int(_MIN_INNER * region.sum()))
+
+    def grow(self, region: Bools, motion: RegionMotion, free: Bools) -> Bools:
+        """A region with all cells around that move with it, or may, on the same surface.
+
+        free: cells that it may take. Cells of it that fit standing still better are dropped.
+        """
+        assert self.flow is not None
+        margin = 3 + max(np.ptp(np.nonzero(region)[0]), np.ptp(np.nonzero(region)[1]))
+        box = box_of(region, int(margin))
+        window = np.zeros(region.shape, bool)
+        window[box] = True
+        which = np.flatnonzero(window)
+        flow = self.flow
+        favour = np.full(region.shape, np.nan)
+        favour.ravel()[which] = favours_motion(
+            self.grid,
+            which,
+            self.cells.disparity_px,
+            flow.error_px,
+            flow.sigma_px,
+            motion.translation_m,
+        )
+        trusted = flow.valid & np.isfinite(favour)
+        stands = trusted & (favour < 0)
+        joins = trusted & (favour > self.config.significance**2)
+        near = cv2.dilate((region | (joins & window)).astype(np.uint8), np.ones((3, 3), np.uint8))
+        unsure = ~joins & ~stands & (near > 0)
+        members = window & self.usable & (free | region) & (joins | unsure | (region & ~stands))
+        labels, count = connect(members, self.cells.disparity_px, self.sigma_px, self._gap_share())
+        touched = np.bincount(labels[region & members], minlength=count + 1)
+        touched[0] = 0
+        # The main part, and others that the region itself already held in good part
+        kept = np.flatnonzero(touched >= max(3, 0.15 * touched.max()))
+        return np.isin(labels, kept) & (labels > 0) if touched.max() > 0 else region & members
+
+    def _gap_share(self) -> float:
+        """Share of the disparity that neighbouring cells of one thing may differ by."""
+        return self.config.depth_gap_share
