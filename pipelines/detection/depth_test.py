@@ -129,8 +129,8 @@ def compare(
     T = invert_T(reference.T_world_camera) @ T_world_camera
     places = static_places(grid, cells.disparity_px, T)
     was_empty, agrees = compare_places(grid, cells, places, reference, sigma_px, config)
-    parallax = _too_much_parallax(grid, cells, T, config.max_parallax_deg)
-    return Comparison(was_empty & ~parallax, agrees & ~parallax, timestamp_s - reference.timestamp_s)
+    alike = _parallax_cos(grid, places, T) > np.cos(np.deg2rad(config.max_parallax_deg))
+    return Comparison(was_empty & alike, agrees & alike, timestamp_s - reference.timestamp_s)
 
 
 def compare_places(
@@ -159,9 +159,9 @@ def compare_places(
     return was_empty, agrees
 
 
-def _too_much_parallax(grid: CellGrid, cells: DepthCells, T: Array, limit_deg: float) -> Bools:
-    """Whether (h, w) two views with T_other_this see a cell's matter from too far apart."""
-    baseline = np.float32(np.linalg.norm(T[:3, 3]))
-    nearness = cells.disparity_px * np.float32(1 / grid.camera.bf)
-    with np.errstate(invalid="ignore"):
-        return baseline * nearness > np.float32(np.tan(np.deg2rad(limit_deg)))
+def _parallax_cos(grid: CellGrid, places: StaticPlaces, T: Array) -> Floats:
+    """Cosine (h, w) of the angle between two views' rays to a cell's matter."""
+    camera = grid.camera
+    x, y = (places.u_px - camera.cx) / camera.fx, (places.v_px - camera.cy) / camera.fy
+    a, b, c = (T[:3, :3].astype(np.float32) @ grid.rays).reshape(3, *grid.shape)
+    return (a * x + b * y + c) / np.sqrt((x * x + y * y + 1) * (a * a + b * b + c * c))

@@ -12,20 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import GeometryConfig
-from pipelines.detection.cells import Bools, CellGrid, DepthCells, Floats
+from pipelines.detection.cells import Bools, CellGrid, DepthCells, Floats, sample
 from pipelines.detection.depth_test import Comparison
-from pipelines.detection.flow_test import FlowResiduals, smooth
+from pipelines.detection.flow_test import FlowResiduals
 from pipelines.detection.masks import box_of
 from pipelines.detection.regions import RegionMotion, connect, favours_motion, fit_motion
-from pipelines.types import Array
+from pipelines.types import Array, Image
 
 _HALF_SURE = 0.5  # strength of flow that counts where older views saw the place empty
 _MIN_INNER = 0.12  # share of a region's cells that have all neighbours in it: else it is a rim
 _LEFT_PLACE = 1.5  # of its own length: by then a moving thing, even one that gathers speed, has gone
+_MIN_LEFT = 0.1  # share of that distance before anything can be said
 _MAX_STILL_SHARE = 0.5  # of a region that older views saw in the same place: it stands
 _GAP_FACTOR = 1.5  # parts of one thing may lie farther apart in depth than cells of one surface
 _STILL = 0.7  # strength of flow below which a cell counts as still
 _MAX_GOES_ON = 0.35  # share of the cells around that are still, and of the same surface
+_BETTER, _GREY_NOISE = 1.3, 1.0  # factor, grey levels: by this an image must fit better
+_MIN_BETTER = 0.15  # share of a region's cells where it must
+_GREY_WINDOW_PX = 15
 _MAX_PART = 0.6  # of the size of the whole
 _PART_DEPTH_M = 1.5  # m, parts of one thing are no farther apart
 _PART_MOTION = 0.15  # share of a thing's motion that its turning gives parts of it
@@ -37,7 +41,8 @@ class Evidence:
     """One frame's cells, all (h, w).
 
     flow: residuals against the frame before, or None. comparisons: with older views. usable:
-    near enough, above the ground. dt_s: time since the frame before. sigma_px: of a cell's
+    near enough, above the ground. images: (H, W) grey of this frame and, as float32, the one before;
+    None without flow. dt_s: time since the frame before. sigma_px: of a cell's
     disparity.
     """
 
@@ -46,6 +51,7 @@ class Evidence:
     flow: FlowResiduals | None
     comparisons: list[Comparison]
     usable: Bools
+    images: tuple[Image, Floats] | None
     dt_s: float
     sigma_px: float
     config: GeometryConfig
@@ -58,8 +64,11 @@ class Evidence:
         was_empty = empty * 2 > len(self.comparisons) if self.comparisons else empty > 0
         if self.flow is None:
             return self.usable & was_empty
-        strength = smooth(self.flow.strength)
-        by_flow = (strength > 1) & self.flow.valid
+        strength = self.flow.strength
+        by_flow = strength > 1
+        # Single cells say little: of nine, three at least
+        around = cv2.boxFilter(by_flow.astype(np.float32), -1, (3, 3), normalize=False)
+        by_flow &= around > 2.5
         # Slow things, and those whose flow cannot be read: only where older views saw through
         by_depth = was_empty & np.where(self.flow.valid, strength > _HALF_SURE, True)
         return self.usable & (by_flow | by_depth)
@@ -122,20 +131,33 @@ class Evidence:
         return float(apart @ np.linalg.solve(covariance + slack * np.eye(3), apart)) < 9.0
 
     def stood(self, region: Bools, motion: RegionMotion | None) -> bool:
-        """Whether older views saw the region where it is now, long enough ago to contradict.
+        """Whether older views saw the region where it is now, so long ago that it cannot move.
 
-        Its motion, if any, must have led it away since: a thing that moved by less than its own
-        size covers its old place in part.
+        A thing that moved by a part of its length still covers its old place in the rest, and
+        depths within the test's gap do not count as different. motion: None where nothing moves.
         """
-        extent_m = 0.0 if motion is None else self._extent_along(region, motion.translation_m)
+        away_m, length_m = 0.0, 1.0
+        if motion is not None:
+            length_m = self._extent_along(region, motion.translation_m) + 0.05
+            disparity = float(np.nanmedian(self.cells.disparity_px[region]))
+            depth_m = self.grid.camera.bf / disparity
+            blur_m = max(
+                self.config.depth_gap_m,
+                self.config.depth_gap_share * depth_m,
+                2 * self.grid.cell_px * depth_m / self.grid.camera.fx,
+            )
+            length_m += blur_m
         for comparison in self.comparisons:
+            limit = _MAX_STILL_SHARE
             if motion is not None:
-                away = float(np.linalg.norm(motion.translation_m)) * comparison.age_s / self.dt_s
-                if away < _LEFT_PLACE * extent_m:
+                away_m = float(np.linalg.norm(motion.translation_m)) * comparison.age_s / self.dt_s
+                left = (away_m - blur_m) / (_LEFT_PLACE * length_m)
+                if left < _MIN_LEFT:
                     continue
+                limit = 1 - (1 - _MAX_STILL_SHARE) * min(left, 1.0)
             agrees = int((comparison.agrees & region).sum())
             seen = agrees + int((comparison.was_empty & region).sum())
-            if seen >= 0.3 * region.sum() and agrees > _MAX_STILL_SHARE * seen:
+            if seen >= 0.3 * region.sum() and agrees > limit * seen:
                 return True
         return False
 
@@ -170,6 +192,41 @@ class Evidence:
         goes_on = ring & (np.abs(inside - d[box]) < gap)
         around = int((outer & ~(cv2.dilate(inner.astype(np.uint8), kernel) > 0)).sum())
         return int(goes_on.sum()) > _MAX_GOES_ON * max(1, around)
+
+    def looks_still(self, region: Bools) -> bool:
+        """Whether the image shows no sign that a region moves.
+
+        Where there is little texture, computed flow follows what passes in front: the image before,
+        read where still matter would have been, then looks as well as where the flow leads.
+        """
+        if self.flow is None or self.images is None:
+            return False
+        box = box_of(region)
+        rows, columns = box
+        size = self.grid.cell_px
+        window = (
+            slice(rows.start * size, rows.stop * size),
+            slice(columns.start * size, columns.stop * size),
+        )
+        gray, before = self.images
+        here = _without_mean(gray[window].astype(np.float32))
+        errors = []
+        flow = self.flow
+        still_u, still_v = flow.from_u_px - flow.error_px[0], flow.from_v_px - flow.error_px[1]
+        for u, v in ((still_u, still_v), (flow.from_u_px, flow.from_v_px)):
+            shape = here.shape[::-1]
+            u, v = (cv2.resize(x[box], shape, interpolation=cv2.INTER_LINEAR) for x in (u, v))
+            there = sample(before, u, v)
+            difference = np.abs(_without_mean(there) - here)
+            cells = (inner.stop - inner.start for inner in (columns, rows))
+            errors.append(cv2.resize(difference, tuple(cells), interpolation=cv2.INTER_AREA))
+        still, moved = errors
+        inside = region[box] & flow.valid[box] & np.isfinite(still) & np.isfinite(moved)
+        if not inside.any():
+            return True
+        better = still[inside] > _BETTER * moved[inside] + _GREY_NOISE
+        worse = moved[inside] > _BETTER * still[inside] + _GREY_NOISE
+        return bool(better.mean() - worse.mean() < _MIN_BETTER)
 
     def was_empty_share(self, region: Bools) -> float:
         """Share of a region that any older view saw through."""
@@ -220,3 +277,8 @@ class Evidence:
     def _gap_share(self) -> float:
         """Share of the disparity that neighbouring cells of one thing may differ by."""
         return self.config.depth_gap_share
+
+
+def _without_mean(gray: Floats) -> Floats:
+    """Grey levels less their mean over a window, so that exposure does not count."""
+    return np.asarray(gray - cv2.blur(gray, (_GREY_WINDOW_PX, _GREY_WINDOW_PX)), np.float32)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from pipelines.config import GeometryConfig
@@ -17,6 +16,8 @@ from pipelines.types import Array
 
 _RETURN_STEPS = 3  # fixed-point steps that turn the flow round; it is smooth inside of things
 _SAME_SHARE = 0.05  # of a disparity, that cells side by side on one surface differ by
+_MIN_SIGMA_DISPARITY_PX = 0.03  # reading between cells is no more exact
+_DISPARITY_ERROR_SHARE = 0.003  # of a disparity, the same for near things
 _DISPARITY_LEVELS = 32.0  # 1 / px, of the sort by nearness
 
 
@@ -145,9 +146,10 @@ def _sigmas(
 ) -> Floats:
     """Standard deviations (3, h, w) of still cells' errors in u, v and disparity."""
     flow, disparity = sigmas_px
+    disparity = max(disparity, _MIN_SIGMA_DISPARITY_PX)
     ego = np.hypot(places.u_px - grid.u_px, places.v_px - grid.v_px)
     by_flow = np.float32(flow) ** 2 + (np.float32(config.flow_error_share) * ego) ** 2
-    d2 = np.float32(disparity**2)
+    d2 = np.float32(disparity**2) + (np.float32(_DISPARITY_ERROR_SHARE) * cells.disparity_px) ** 2
     pose = _pose_variance(grid, cells.disparity_px, pose_covariance)
     variance = np.stack(
         [
@@ -175,8 +177,3 @@ def _pose_variance(grid: CellGrid, disparity_px: Floats, covariance: Array) -> F
     v = f2 * ((1 + y * y) ** 2 * wx + (x * y) ** 2 * wy + x * x * wz + i2 * (ty + y * y * tz))
     d = bf2 * i2 * (y * y * wx + x * x * wy + i2 * tz)
     return np.stack([u, v, d])
-
-
-def smooth(values: Floats) -> Floats:
-    """Median over 3 x 3 cells, NaN taken as 0: single cells say little."""
-    return np.asarray(cv2.medianBlur(np.nan_to_num(values), 3), np.float32)

@@ -30,7 +30,7 @@ from pipelines.detection.regions import RegionMotion
 from pipelines.geometry import invert_T
 from pipelines.object_types import UNNAMED_CLASS, Detections
 from pipelines.shapes import check_shape
-from pipelines.types import Array, StereoCamera
+from pipelines.types import Array, Image, StereoCamera
 
 _MIN_KEPT = 0.4  # share of a mask that a repair must keep to be believed
 _FIRST_BELIEF = 0.6  # in a nameless instance that another source brings, or a new one
@@ -41,7 +41,7 @@ class GeometryView:
     """One frame with its pose, as geometry sees it.
 
     frame_index: by it is known whether the flow begins at the view segmented last.
-    disparity_px: (H, W) float32, NaN unknown. T_world_camera: (4, 4). pose_covariance: (6, 6) of
+    gray: (H, W) uint8. disparity_px: (H, W) float32, NaN unknown. T_world_camera: (4, 4). pose_covariance: (6, 6) of
     the right perturbation [omega rad, v m] against the frame before. flow_prev_to_curr_px:
     (H, W, 2) float32 on the pixels of the frame before, NaN unknown, or None. sigma_disparity_px,
     sigma_flow_px: standard deviations as learned by the front-end.
@@ -49,6 +49,7 @@ class GeometryView:
 
     frame_index: int
     timestamp_s: float
+    gray: Image
     disparity_px: Floats
     T_world_camera: Array
     pose_covariance: Array
@@ -138,10 +139,11 @@ class MultiViewGeometry:
             compare(grid, cells, reference, pose, sigma, config)
             for reference in self._memory.overlapping(*pose)
         ]
-        flow, dt_s = None, 0.1
+        flow, images, dt_s = None, None, 0.1
         if self._last is not None and view.flow_prev_to_curr_px is not None:
             last, cells_before = self._last
             if view.frame_index - last.frame_index == 1:
+                images = (view.gray, last.gray.astype(np.float32))
                 dt_s = max(view.timestamp_s - last.timestamp_s, 1e-3)
                 T_last_this = invert_T(last.T_world_camera) @ view.T_world_camera
                 flow = test_flow(
@@ -155,7 +157,7 @@ class MultiViewGeometry:
                     config.min_speed_mps * dt_s,
                     config,
                 )
-        return Evidence(grid, cells, flow, comparisons, usable, dt_s, sigma, config)
+        return Evidence(grid, cells, flow, comparisons, usable, images, dt_s, sigma, config)
 
     def _remember(self, view: GeometryView, evidence: Evidence, instances: list[_Instance]) -> None:
         """Keep the view for later ones; what moves in it is left out, as it will be elsewhere."""
@@ -256,6 +258,8 @@ class MultiViewGeometry:
             return None
         motion = evidence.motion_of(region)
         if motion is None or not evidence.is_moving(region, motion) or evidence.is_patch(region):
+            return None
+        if evidence.looks_still(region):
             return None
         return _Instance(0, UNNAMED_CLASS, evidence.score(motion), region, motion)
 

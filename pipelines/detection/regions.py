@@ -110,7 +110,7 @@ def fit_motion(
         translation = np.linalg.solve(information, np.einsum("nij,ni->j", weighted, r))
         left = np.linalg.norm(r - J @ translation, axis=1)
         weight = 1 / (1 + (left / scale) ** 2)
-    agrees = left < np.maximum(3.5, 0.35 * size)
+    agrees = left < np.maximum(3.5, 0.5 * size)
     # Neighbours err alike: a patch of the flow is about four cells
     covariance = 4 * np.linalg.inv(information)
     return RegionMotion(translation, covariance, float(agrees.mean()))
