@@ -17,7 +17,7 @@ from pipelines.detection.depth_test import Comparison
 from pipelines.detection.flow_test import FlowResiduals
 from pipelines.detection.masks import box_of
 from pipelines.detection.regions import RegionMotion, connect, favours_motion, fit_motion
-from pipelines.types import Array, Image
+from pipelines.types import Array
 
 _HALF_SURE = 0.5  # strength of flow that counts where older views saw the place empty
 _MIN_INNER = 0.12  # share of a region's cells that have all neighbours in it: else it is a rim
@@ -27,8 +27,7 @@ _MAX_STILL_SHARE = 0.5  # of a region that older views saw in the same place: it
 _GAP_FACTOR = 1.5  # parts of one thing may lie farther apart in depth than cells of one surface
 _STILL = 0.7  # strength of flow below which a cell counts as still
 _MAX_GOES_ON = 0.35  # share of the cells around that are still, and of the same surface
-_BETTER, _GREY_NOISE = 1.3, 1.0  # factor, grey levels: by this an image must fit better
-_MIN_BETTER = 0.15  # share of a region's cells where it must
+_WORSE, _WORSE_GREY = 1.5, 1.0  # factor, grey levels: so much worse must stillness look
 _GREY_WINDOW_PX = 15
 _MAX_PART = 0.6  # of the size of the whole
 _PART_DEPTH_M = 1.5  # m, parts of one thing are no farther apart
@@ -41,8 +40,8 @@ class Evidence:
     """One frame's cells, all (h, w).
 
     flow: residuals against the frame before, or None. comparisons: with older views. usable:
-    near enough, above the ground. images: (H, W) grey of this frame and, as float32, the one before;
-    None without flow. dt_s: time since the frame before. sigma_px: of a cell's
+    near enough, above the ground. images: (H, W) grey, smoothed, of this frame and
+    the one before, or None. dt_s: time since the frame before. sigma_px: of a cell's
     disparity.
     """
 
@@ -51,7 +50,7 @@ class Evidence:
     flow: FlowResiduals | None
     comparisons: list[Comparison]
     usable: Bools
-    images: tuple[Image, Floats] | None
+    images: tuple[Floats, Floats] | None
     dt_s: float
     sigma_px: float
     config: GeometryConfig
@@ -209,24 +208,26 @@ class Evidence:
             slice(columns.start * size, columns.stop * size),
         )
         gray, before = self.images
-        here = _without_mean(gray[window].astype(np.float32))
-        errors = []
+        here = gray[window]
         flow = self.flow
         still_u, still_v = flow.from_u_px - flow.error_px[0], flow.from_v_px - flow.error_px[1]
+        errors = []
         for u, v in ((still_u, still_v), (flow.from_u_px, flow.from_v_px)):
             shape = here.shape[::-1]
             u, v = (cv2.resize(x[box], shape, interpolation=cv2.INTER_LINEAR) for x in (u, v))
             there = sample(before, u, v)
-            difference = np.abs(_without_mean(there) - here)
-            cells = (inner.stop - inner.start for inner in (columns, rows))
-            errors.append(cv2.resize(difference, tuple(cells), interpolation=cv2.INTER_AREA))
-        still, moved = errors
-        inside = region[box] & flow.valid[box] & np.isfinite(still) & np.isfinite(moved)
+            # Less its mean, so that exposure does not count; NaN would spread through it
+            known = np.isfinite(there)
+            difference = np.where(known, there - here, np.float32(0))
+            difference -= cv2.blur(difference, (_GREY_WINDOW_PX, _GREY_WINDOW_PX))
+            difference = np.where(known, np.abs(difference), np.float32(np.nan))
+            n_cells = (columns.stop - columns.start, rows.stop - rows.start)
+            errors.append(cv2.resize(difference, n_cells, interpolation=cv2.INTER_AREA))
+        inside = region[box] & flow.valid[box] & np.isfinite(errors[0]) & np.isfinite(errors[1])
         if not inside.any():
             return True
-        better = still[inside] > _BETTER * moved[inside] + _GREY_NOISE
-        worse = moved[inside] > _BETTER * still[inside] + _GREY_NOISE
-        return bool(better.mean() - worse.mean() < _MIN_BETTER)
+        still, moved = (float(error[inside].mean()) for error in errors)
+        return still < max(_WORSE * moved, moved + _WORSE_GREY)
 
     def was_empty_share(self, region: Bools) -> float:
         """Share of a region that any older view saw through."""
@@ -277,8 +278,3 @@ class Evidence:
     def _gap_share(self) -> float:
         """Share of the disparity that neighbouring cells of one thing may differ by."""
         return self.config.depth_gap_share
-
-
-def _without_mean(gray: Floats) -> Floats:
-    """Grey levels less their mean over a window, so that exposure does not count."""
-    return np.asarray(gray - cv2.blur(gray, (_GREY_WINDOW_PX, _GREY_WINDOW_PX)), np.float32)

@@ -139,11 +139,12 @@ class MultiViewGeometry:
             compare(grid, cells, reference, pose, sigma, config)
             for reference in self._memory.overlapping(*pose)
         ]
-        flow, images, dt_s = None, None, 0.1
+        flow, dt_s = None, 0.1
+        images: tuple[Floats, Floats] | None = None
         if self._last is not None and view.flow_prev_to_curr_px is not None:
             last, cells_before = self._last
             if view.frame_index - last.frame_index == 1:
-                images = (view.gray, last.gray.astype(np.float32))
+                images = (_smooth(view.gray), _smooth(last.gray))
                 dt_s = max(view.timestamp_s - last.timestamp_s, 1e-3)
                 T_last_this = invert_T(last.T_world_camera) @ view.T_world_camera
                 flow = test_flow(
@@ -322,3 +323,8 @@ class MultiViewGeometry:
             else np.empty(0, "U16"),
             np.array([i.score for i in instances], np.float64),
         )
+
+
+def _smooth(gray: Image) -> Floats:
+    """Grey levels (H, W) float32 with most of the sensor's noise gone."""
+    return np.asarray(cv2.GaussianBlur(gray, (5, 5), 0), np.float32)
