@@ -180,6 +180,7 @@ class GeometryConfig:
     cell_px: int = 4  # px, side of the cells that all is tested on; finer sees smaller things
     significance: float = 3.5  # standard deviations of noise that a still thing may show
     min_speed_mps: float = 0.15  # m/s, slower things count as still
+    max_speed_mps: float = 40.0  # m/s, along the view; faster is a mistake of flow
     max_range_m: float = 60.0  # m, farther cells are not tested
     flow_sigma_px: float = 0.3  # px, least standard deviation of dense flow, of any source
     flow_error_share: float = 0.02  # of the ego-motion flow, which computed flow errs by
@@ -198,6 +199,7 @@ class GeometryConfig:
 
     def __post_init__(self) -> None:
         _check(self, cell_px=(1, 16), significance=(1, 20), min_speed_mps=(0, 100))
+        _check(self, max_speed_mps=(0.1, 1000))
         _check(self, max_range_m=(0.5, 1000), flow_sigma_px=(0.001, 10), flow_error_share=(0, 0.5))
         _check(self, max_flow_miss_px=(0.01, 100), depth_gap_m=(0.001, 10))
         _check(self, depth_gap_share=(0.001, 0.5), n_references=(0, 20), reference_every=(1, 100))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from pipelines.config import GeometryConfig
@@ -18,6 +19,7 @@ _RETURN_STEPS = 3  # fixed-point steps that turn the flow round; it is smooth in
 _SAME_SHARE = 0.05  # of a disparity, that cells side by side on one surface differ by
 _MIN_SIGMA_DISPARITY_PX = 0.03  # reading between cells is no more exact
 _DISPARITY_ERROR_SHARE = 0.003  # of a disparity, the same for near things
+_BLEEDING_CELLS = 2  # so far does computed flow follow the nearer thing beyond its border
 _DISPARITY_LEVELS = 32.0  # 1 / px, of the sort by nearness
 
 
@@ -49,7 +51,7 @@ def test_flow(
     flow_px: Floats,
     sigmas_px: tuple[float, float],
     pose_covariance: Array,
-    min_motion_m: float,
+    dt_s: float,
     config: GeometryConfig,
 ) -> FlowResiduals:
     """Residuals of every cell.
@@ -57,7 +59,7 @@ def test_flow(
     cells, previous: depth of the present and the previous frame. places: of the present cells in
     the previous frame. flow_px: (H, W, 2) previous -> current on the previous pixels, NaN unknown.
     sigmas_px: of flow and of cell disparity. pose_covariance: (6, 6) [omega rad, v m] of the
-    motion between the frames. min_motion_m: slower things are still.
+    motion between the frames. dt_s: time between them.
     """
     u, v, miss = _matter_before(grid, previous, places, flow_px)
     column, row = grid.to_cells(u, v)
@@ -68,10 +70,14 @@ def test_flow(
     valid &= np.isfinite(error).all(axis=0)
     # What has come into the image has no flow, but computed flow is everywhere
     valid &= _inside(grid, places.u_px, places.v_px)
+    valid &= ~_was_hidden(grid, previous, places, before, config.depth_gap_share)
+    # Nothing jumps: such an error is of two things, one before and one behind the other
+    fastest = np.float32(config.max_speed_mps * dt_s / grid.camera.bf) * cells.disparity_px**2
+    valid &= np.abs(error[2]) < fastest + np.float32(config.significance * sigmas_px[1])
     sigma = _sigmas(grid, cells, places, sigmas_px, pose_covariance, config)
     # What still things may show: noise, and the least motion that counts, seen at this depth
     per_metre = cells.disparity_px * np.float32(grid.camera.fx / grid.camera.bf)
-    least_uv = np.float32(min_motion_m) * per_metre
+    least_uv = np.float32(config.min_speed_mps * dt_s) * per_metre
     least_d = least_uv * cells.disparity_px / np.float32(grid.camera.fx)
     allowed = np.float32(config.significance) * sigma
     allowed_uv = np.hypot(allowed[0], allowed[1]) * np.float32(np.sqrt(0.5)) + least_uv
@@ -87,6 +93,22 @@ def _disparity_before(previous: DepthCells, column: Floats, row: Floats) -> Floa
     nearest = sample(previous.disparity_px, column, row, nearest=True)
     between = sample(previous.disparity_px, column, row)
     return np.where(np.abs(between - nearest) < _SAME_SHARE * nearest, between, nearest)
+
+
+def _was_hidden(
+    grid: CellGrid, previous: DepthCells, places: StaticPlaces, before: Floats, gap_share: float
+) -> Bools:
+    """Which cells, if still, were behind something nearer, or beside it, a frame before.
+
+    There is no flow of what was hidden, but computed flow is everywhere, and close by it follows
+    what is in front. What was in front may be the thing itself, where its flow comes from.
+    """
+    size = 2 * _BLEEDING_CELLS + 1
+    kernel = np.ones((size, size), np.uint8)
+    nearest = cv2.dilate(np.nan_to_num(previous.disparity_px), kernel)
+    front = sample(nearest, *grid.to_cells(places.u_px, places.v_px), nearest=True)
+    itself = front < before * np.float32(1 + 2 * gap_share)
+    return (front > places.disparity_px * np.float32(1 + 2 * gap_share)) & ~itself
 
 
 def _inside(grid: CellGrid, u_px: Floats, v_px: Floats) -> Bools:

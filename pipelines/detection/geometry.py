@@ -155,7 +155,7 @@ class MultiViewGeometry:
                     view.flow_prev_to_curr_px,
                     (max(view.sigma_flow_px, config.flow_sigma_px), sigma),
                     np.nan_to_num(view.pose_covariance),
-                    config.min_speed_mps * dt_s,
+                    dt_s,
                     config,
                 )
         return Evidence(grid, cells, flow, comparisons, usable, images, dt_s, sigma, config)
