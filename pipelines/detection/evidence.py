@@ -26,8 +26,10 @@ _MIN_LEFT = 0.1  # share of that distance before anything can be said
 _MAX_STILL_SHARE = 0.5  # of a region that older views saw in the same place: it stands
 _GAP_FACTOR = 1.5  # parts of one thing may lie farther apart in depth than cells of one surface
 _STILL = 0.7  # strength of flow below which a cell counts as still
+_MAX_COMPONENTS = 20  # the largest of a frame are judged
+_SAME_SURFACE = 0.6  # share of the gap between things within which a surface goes on
 _MAX_GOES_ON = 0.35  # share of the cells around that are still, and of the same surface
-_WORSE, _WORSE_GREY = 1.5, 1.0  # factor, grey levels: so much worse must stillness look
+_WORSE, _WORSE_GREY = 1.3, 0.7  # factor, grey levels: so much worse must stillness look
 _GREY_WINDOW_PX = 15
 _MAX_PART = 0.6  # of the size of the whole
 _PART_DEPTH_M = 1.5  # m, parts of one thing are no farther apart
@@ -74,11 +76,12 @@ class Evidence:
 
     def components(self, moving: Bools) -> list[Bools]:
         """Moving cells by connectedness in depth, the largest first; tiny ones left out."""
-        gap = self._gap_share() * _GAP_FACTOR
+        gap = self.config.depth_gap_share * _GAP_FACTOR
         labels, count = connect(moving, self.cells.disparity_px, self.sigma_px, gap)
         sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
         order = np.argsort(-sizes, kind="stable")
-        return [labels == i + 1 for i in order if sizes[i] >= max(3, self.config.min_cells // 2)]
+        large = order[sizes[order] >= max(3, self.config.min_cells // 2)]
+        return [labels == i + 1 for i in large[:_MAX_COMPONENTS]]
 
     def motion_of(self, region: Bools) -> RegionMotion | None:
         """How a region moves since the frame before; None without flow in it."""
@@ -187,7 +190,7 @@ class Evidence:
             borderType=cv2.BORDER_CONSTANT,
         )
         inside = summed / np.maximum(total, np.float32(0.5))
-        gap = self.config.depth_gap_share * d[box] + 4 * self.sigma_px
+        gap = _SAME_SURFACE * self.config.depth_gap_share * d[box] + 4 * self.sigma_px
         goes_on = ring & (np.abs(inside - d[box]) < gap)
         around = int((outer & ~(cv2.dilate(inner.astype(np.uint8), kernel) > 0)).sum())
         return int(goes_on.sum()) > _MAX_GOES_ON * max(1, around)
@@ -247,34 +250,39 @@ class Evidence:
         free: cells that it may take. Cells of it that fit standing still better are dropped.
         """
         assert self.flow is not None
-        margin = 3 + max(np.ptp(np.nonzero(region)[0]), np.ptp(np.nonzero(region)[1]))
-        box = box_of(region, int(margin))
-        window = np.zeros(region.shape, bool)
-        window[box] = True
-        which = np.flatnonzero(window)
-        flow = self.flow
-        favour = np.full(region.shape, np.nan)
-        favour.ravel()[which] = favours_motion(
+        rows, columns = np.nonzero(region)
+        box = box_of(region, int(3 + max(np.ptp(rows), np.ptp(columns))))
+        inner, flow = region[box], self.flow
+        favour = self._favour(box, motion.translation_m)
+        trusted = flow.valid[box] & np.isfinite(favour)
+        stands = trusted & (favour < 0)
+        joins = trusted & (favour > self.config.significance**2)
+        near = cv2.dilate((inner | joins).astype(np.uint8), np.ones((3, 3), np.uint8))
+        unsure = ~joins & ~stands & (near > 0)
+        members = self.usable[box] & (free[box] | inner) & (joins | unsure | (inner & ~stands))
+        gap = self.config.depth_gap_share
+        labels, count = connect(members, self.cells.disparity_px[box], self.sigma_px, gap)
+        touched = np.bincount(labels[inner & members], minlength=count + 1)
+        touched[0] = 0
+        # The main part, and others that the region itself already held in good part
+        kept = touched >= max(3, 0.15 * touched.max(initial=0))
+        kept[0] = False
+        grown = np.zeros(region.shape, bool)
+        grown[box] = kept[labels]
+        return grown
+
+    def _favour(self, box: tuple[slice, slice], translation_m: Array) -> Array:
+        """By how much each cell of a window fits moving better than standing, chi-square."""
+        assert self.flow is not None
+        rows, columns = box
+        index = np.arange(self.grid.shape[0] * self.grid.shape[1]).reshape(self.grid.shape)
+        which = index[box].ravel()
+        favour = favours_motion(
             self.grid,
             which,
             self.cells.disparity_px,
-            flow.error_px,
-            flow.sigma_px,
-            motion.translation_m,
+            self.flow.error_px,
+            self.flow.sigma_px,
+            translation_m,
         )
-        trusted = flow.valid & np.isfinite(favour)
-        stands = trusted & (favour < 0)
-        joins = trusted & (favour > self.config.significance**2)
-        near = cv2.dilate((region | (joins & window)).astype(np.uint8), np.ones((3, 3), np.uint8))
-        unsure = ~joins & ~stands & (near > 0)
-        members = window & self.usable & (free | region) & (joins | unsure | (region & ~stands))
-        labels, count = connect(members, self.cells.disparity_px, self.sigma_px, self._gap_share())
-        touched = np.bincount(labels[region & members], minlength=count + 1)
-        touched[0] = 0
-        # The main part, and others that the region itself already held in good part
-        kept = np.flatnonzero(touched >= max(3, 0.15 * touched.max()))
-        return np.isin(labels, kept) & (labels > 0) if touched.max() > 0 else region & members
-
-    def _gap_share(self) -> float:
-        """Share of the disparity that neighbouring cells of one thing may differ by."""
-        return self.config.depth_gap_share
+        return favour.reshape(rows.stop - rows.start, columns.stop - columns.start)

@@ -252,15 +252,13 @@ class MultiViewGeometry:
         motion = evidence.motion_of(component)
         if motion is None:
             return None  # a place that filled while nobody looked is no motion of now
-        if not evidence.is_moving(component, motion):
+        if not evidence.is_moving(component, motion) or evidence.looks_still(component):
             return None
         region = evidence.grow(component, motion, free)
         if region.sum() < config.min_cells or evidence.is_rim(region):
             return None
         motion = evidence.motion_of(region)
         if motion is None or not evidence.is_moving(region, motion) or evidence.is_patch(region):
-            return None
-        if evidence.looks_still(region):
             return None
         return _Instance(0, UNNAMED_CLASS, evidence.score(motion), region, motion)
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pipelines.detection.cells import Bools, CellGrid, Floats
 from pipelines.types import Array
 
-_ROUNDS = 4  # of reweighting; more change little
-_MAX_FIT_CELLS = 400  # a sample of a large region says as much
+_ROUNDS = 3  # of reweighting; more change little
+_MAX_FIT_CELLS = 250  # a sample of a large region says as much
 
 Labels = NDArray[np.int32]
 
@@ -72,8 +72,8 @@ def image_motion(grid: CellGrid, which: NDArray, disparity_px: Floats) -> Array:
     Of matter that moved by a translation to where the cell sees it now: before, it was that much
     back, so the signs are those of the errors of the flow test.
     """
-    x, y = grid.rays[0][which].astype(np.float64), grid.rays[1][which].astype(np.float64)
-    d = disparity_px.ravel()[which].astype(np.float64)
+    x, y = grid.rays[0][which], grid.rays[1][which]
+    d = disparity_px.ravel()[which]
     camera = grid.camera
     inverse = d / camera.bf
     J = np.zeros((len(x), 3, 3))
