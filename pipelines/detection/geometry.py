@@ -190,10 +190,10 @@ class MultiViewGeometry:
             )
             motion = evidence.motion_of(cells)
             if motion is not None and evidence.is_moving(cells, motion):
-                instance.motion = motion
                 grown = evidence.grow(cells, motion, labels == 0)
-                # Evidence that denies most of a mask denies itself
-                if grown.sum() >= _MIN_KEPT * cells.sum():
+                # Evidence that denies most of a mask, or runs out onto what stands, denies itself
+                if grown.sum() >= _MIN_KEPT * cells.sum() and not evidence.is_patch(grown):
+                    instance.motion = motion
                     labels[cells & ~grown] = 0
                     labels[grown] = label
                     instance.cells, instance.repaired = grown, True
