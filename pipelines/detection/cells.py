@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.types import Array, Image, StereoCamera
+from pipelines.types import Array, StereoCamera
 
 _MIN_KNOWN = 0.4  # share of a cell's pixels that must have a disparity
 _EDGE_SHARE = 0.05  # disparities in one cell that spread by more than this share of their mean
@@ -112,14 +112,14 @@ def static_places(grid: CellGrid, disparity_px: Floats, T_other_this: Array) -> 
     """
     camera = grid.camera
     R, t = T_other_this[:3, :3].astype(np.float32), T_other_this[:3, 3] / camera.bf
-    tx, ty, tz = (np.float32(x) for x in t)
+    tx, ty, tz = t.astype(np.float32)
     turned = (R @ grid.rays).reshape(3, *grid.shape)
     nx, ny, nz = (turned[i] + ti * disparity_px for i, ti in enumerate((tx, ty, tz)))
     nz = np.where(nz > 1e-3, nz, np.float32(np.nan))
     inverse = np.float32(1) / nz
     x, y = nx * inverse, ny * inverse
     fx, fy = np.float32(camera.fx), np.float32(camera.fy)
-    d = disparity_px * inverse
+    d = np.asarray(disparity_px * inverse, np.float32)
     return StaticPlaces(
         fx * x + np.float32(camera.cx),
         fy * y + np.float32(camera.cy),
@@ -138,11 +138,3 @@ def sample(image: NDArray, u: Floats, v: Floats, nearest: bool = False) -> Float
     u, v = (np.where(np.isfinite(x) & (np.abs(x) < 1e4), x, far) for x in (u, v))
     found = cv2.remap(image, u, v, how, borderMode=cv2.BORDER_CONSTANT, borderValue=outside)
     return np.asarray(found, np.float32)
-
-
-def texture(grid: CellGrid, gray: Image) -> Floats:
-    """Mean gradient (h, w) float32 of grey levels per pixel, in each cell."""
-    u = cv2.Sobel(gray, cv2.CV_16S, 1, 0, scale=1)
-    v = cv2.Sobel(gray, cv2.CV_16S, 0, 1, scale=1)
-    strength = cv2.addWeighted(cv2.convertScaleAbs(u), 0.5, cv2.convertScaleAbs(v), 0.5, 0)
-    return grid.mean(strength) * np.float32(1 / 4)

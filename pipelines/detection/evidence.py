@@ -9,28 +9,29 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.config import GeometryConfig
-from pipelines.detection.cells import Bools, CellGrid, DepthCells, Floats, sample
+from pipelines.detection.cells import Bools, CellGrid, DepthCells, Floats
 from pipelines.detection.depth_test import Comparison
 from pipelines.detection.flow_test import FlowResiduals
+from pipelines.detection.image_test import looks_still
 from pipelines.detection.masks import box_of
 from pipelines.detection.regions import RegionMotion, connect, favours_motion, fit_motion
 from pipelines.types import Array
 
 _HALF_SURE = 0.5  # strength of flow that counts where older views saw the place empty
 _MIN_INNER = 0.12  # share of a region's cells that have all neighbours in it: else it is a rim
-_LEFT_PLACE = 1.5  # of its own length: by then a moving thing, even one that gathers speed, has gone
+_LEFT_PLACE = (
+    1.5  # of its own length: by then a moving thing, even one that gathers speed, has gone
+)
 _MIN_LEFT = 0.1  # share of that distance before anything can be said
 _MAX_STILL_SHARE = 0.5  # of a region that older views saw in the same place: it stands
 _GAP_FACTOR = 1.5  # parts of one thing may lie farther apart in depth than cells of one surface
 _STILL = 0.7  # strength of flow below which a cell counts as still
 _MAX_COMPONENTS = 20  # the largest of a frame are judged
+_AROUND_CELLS = 3  # width of the surroundings that are looked at, but for the first cell
 _SAME_SURFACE = 0.6  # share of the gap between things within which a surface goes on
 _MAX_GOES_ON = 0.35  # share of the cells around that are still, and of the same surface
-_WORSE, _WORSE_GREY = 1.3, 0.7  # factor, grey levels: so much worse must stillness look
-_GREY_WINDOW_PX = 15
 _MAX_PART = 0.6  # of the size of the whole
 _PART_DEPTH_M = 1.5  # m, parts of one thing are no farther apart
 _PART_MOTION = 0.15  # share of a thing's motion that its turning gives parts of it
@@ -89,9 +90,7 @@ class Evidence:
             return None
         which = np.flatnonzero(region & self.flow.valid)
         flow = self.flow
-        return fit_motion(
-            self.grid, which, self.cells.disparity_px, flow.error_px, flow.sigma_px
-        )
+        return fit_motion(self.grid, which, self.cells.disparity_px, flow.error_px, flow.sigma_px)
 
     def certainty(self, motion: RegionMotion) -> float:
         """By how many standard deviations a motion exceeds the least that counts."""
@@ -176,61 +175,28 @@ class Evidence:
         """Whether a region is a piece of a still surface, that goes on beyond its border."""
         if self.flow is None:
             return False
-        kernel = np.ones((3, 3), np.uint8)
-        d = self.cells.disparity_px
-        box = box_of(region, 4)
-        inner = region[box]
-        outer = cv2.dilate(inner.astype(np.uint8), kernel, iterations=3) > 0
-        ring = outer & ~(cv2.dilate(inner.astype(np.uint8), kernel) > 0)
-        ring &= self.usable[box] & self.flow.valid[box] & (self.flow.strength[box] < _STILL)
-        weight = inner.astype(np.float32)
-        total = cv2.boxFilter(weight, -1, (9, 9), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        summed = cv2.boxFilter(
-            np.nan_to_num(d[box]) * weight, -1, (9, 9), normalize=False,
-            borderType=cv2.BORDER_CONSTANT,
+        box = box_of(region, _AROUND_CELLS + 1)
+        inner, d, kernel = region[box], self.cells.disparity_px[box], np.ones((3, 3), np.uint8)
+        near, far = (
+            cv2.dilate(inner.astype(np.uint8), kernel, iterations=n) > 0 for n in (1, _AROUND_CELLS)
+        )
+        around = far & ~near
+        weight = (inner & np.isfinite(d)).astype(np.float32)
+        total, summed = (
+            cv2.boxFilter(x, -1, (9, 9), normalize=False, borderType=cv2.BORDER_CONSTANT)
+            for x in (weight, np.nan_to_num(d) * weight)
         )
         inside = summed / np.maximum(total, np.float32(0.5))
-        gap = _SAME_SURFACE * self.config.depth_gap_share * d[box] + 4 * self.sigma_px
-        goes_on = ring & (np.abs(inside - d[box]) < gap)
-        around = int((outer & ~(cv2.dilate(inner.astype(np.uint8), kernel) > 0)).sum())
-        return int(goes_on.sum()) > _MAX_GOES_ON * max(1, around)
+        gap = _SAME_SURFACE * self.config.depth_gap_share * d + 4 * self.sigma_px
+        still = self.usable[box] & self.flow.valid[box] & (self.flow.strength[box] < _STILL)
+        goes_on = around & still & (np.abs(inside - d) < gap)
+        return int(goes_on.sum()) > _MAX_GOES_ON * max(1, int(around.sum()))
 
     def looks_still(self, region: Bools) -> bool:
-        """Whether the image shows no sign that a region moves.
-
-        Where there is little texture, computed flow follows what passes in front: the image before,
-        read where still matter would have been, then looks as well as where the flow leads.
-        """
+        """Whether the image shows no sign that a region moves; False where there is no flow."""
         if self.flow is None or self.images is None:
             return False
-        box = box_of(region)
-        rows, columns = box
-        size = self.grid.cell_px
-        window = (
-            slice(rows.start * size, rows.stop * size),
-            slice(columns.start * size, columns.stop * size),
-        )
-        gray, before = self.images
-        here = gray[window]
-        flow = self.flow
-        still_u, still_v = flow.from_u_px - flow.error_px[0], flow.from_v_px - flow.error_px[1]
-        errors = []
-        for u, v in ((still_u, still_v), (flow.from_u_px, flow.from_v_px)):
-            shape = here.shape[::-1]
-            u, v = (cv2.resize(x[box], shape, interpolation=cv2.INTER_LINEAR) for x in (u, v))
-            there = sample(before, u, v)
-            # Less its mean, so that exposure does not count; NaN would spread through it
-            known = np.isfinite(there)
-            difference = np.where(known, there - here, np.float32(0))
-            difference -= cv2.blur(difference, (_GREY_WINDOW_PX, _GREY_WINDOW_PX))
-            difference = np.where(known, np.abs(difference), np.float32(np.nan))
-            n_cells = (columns.stop - columns.start, rows.stop - rows.start)
-            errors.append(cv2.resize(difference, n_cells, interpolation=cv2.INTER_AREA))
-        inside = region[box] & flow.valid[box] & np.isfinite(errors[0]) & np.isfinite(errors[1])
-        if not inside.any():
-            return True
-        still, moved = (float(error[inside].mean()) for error in errors)
-        return still < max(_WORSE * moved, moved + _WORSE_GREY)
+        return looks_still(self.grid, self.images, self.flow, region)
 
     def was_empty_share(self, region: Bools) -> float:
         """Share of a region that any older view saw through."""

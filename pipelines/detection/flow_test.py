@@ -43,7 +43,7 @@ class FlowResiduals:
     strength: Floats
 
 
-def test_flow(
+def flow_residuals(
     grid: CellGrid,
     cells: DepthCells,
     previous: DepthCells,
@@ -154,8 +154,9 @@ def _first_guess(
     target += np.rint(column.ravel()[source]).astype(np.int64)
     u, v = places.u_px.ravel().copy(), places.v_px.ravel().copy()
     u[target], v[target] = grid.u_px.ravel()[source], grid.v_px.ravel()[source]
-    u, v = u.reshape(h, w), v.reshape(h, w)
-    return np.where(np.isfinite(u), u, grid.u_px), np.where(np.isfinite(v), v, grid.v_px)
+    known = np.isfinite(u) & np.isfinite(v)
+    u, v = np.where(known, u, grid.u_px.ravel()), np.where(known, v, grid.v_px.ravel())
+    return u.reshape(h, w), v.reshape(h, w)
 
 
 def _sigmas(

@@ -21,9 +21,16 @@ from pipelines.detection.cells import (
     sample,
     static_places,
 )
-from pipelines.detection.depth_test import Comparison, Reference, ViewMemory, compare, make_reference
+from pipelines.detection.depth_test import (
+    Comparison,
+    Reference,
+    ViewMemory,
+    compare,
+    make_reference,
+)
 from pipelines.detection.evidence import Evidence
-from pipelines.detection.flow_test import test_flow
+from pipelines.detection.flow_test import flow_residuals
+from pipelines.detection.geometry_view import GeometryView
 from pipelines.detection.ground import fit_ground, heights_above
 from pipelines.detection.masks import labels_of_cells, paint, pixels_of_cells
 from pipelines.detection.regions import RegionMotion
@@ -34,36 +41,6 @@ from pipelines.types import Array, Image, StereoCamera
 
 _MIN_KEPT = 0.4  # share of a mask that a repair must keep to be believed
 _FIRST_BELIEF = 0.6  # in a nameless instance that another source brings, or a new one
-
-
-@dataclass(frozen=True, slots=True)
-class GeometryView:
-    """One frame with its pose, as geometry sees it.
-
-    frame_index: by it is known whether the flow begins at the view segmented last.
-    gray: (H, W) uint8. disparity_px: (H, W) float32, NaN unknown. T_world_camera: (4, 4). pose_covariance: (6, 6) of
-    the right perturbation [omega rad, v m] against the frame before. flow_prev_to_curr_px:
-    (H, W, 2) float32 on the pixels of the frame before, NaN unknown, or None. sigma_disparity_px,
-    sigma_flow_px: standard deviations as learned by the front-end.
-    """
-
-    frame_index: int
-    timestamp_s: float
-    gray: Image
-    disparity_px: Floats
-    T_world_camera: Array
-    pose_covariance: Array
-    flow_prev_to_curr_px: Floats | None
-    sigma_disparity_px: float
-    sigma_flow_px: float
-
-    def __post_init__(self) -> None:
-        check_shape("GeometryView", "disparity_px", self.disparity_px, (None, None))
-        check_shape("GeometryView", "T_world_camera", self.T_world_camera, (4, 4))
-        check_shape("GeometryView", "pose_covariance", self.pose_covariance, (6, 6))
-        if self.flow_prev_to_curr_px is not None:
-            shape = (*self.disparity_px.shape, 2)
-            check_shape("GeometryView", "flow_prev_to_curr_px", self.flow_prev_to_curr_px, shape)
 
 
 @dataclass(slots=True)
@@ -147,7 +124,7 @@ class MultiViewGeometry:
                 images = (_smooth(view.gray), _smooth(last.gray))
                 dt_s = max(view.timestamp_s - last.timestamp_s, 1e-3)
                 T_last_this = invert_T(last.T_world_camera) @ view.T_world_camera
-                flow = test_flow(
+                flow = flow_residuals(
                     grid,
                     cells,
                     cells_before,
@@ -199,6 +176,9 @@ class MultiViewGeometry:
                     instance.cells, instance.repaired = grown, True
             if instance.class_name != UNNAMED_CLASS or self._still_believed(evidence, instance):
                 instances.append(instance)
+        self._belief = {
+            i.label: self._belief[i.label] for i in instances if i.label in self._belief
+        }
         return instances
 
     def _still_believed(self, evidence: Evidence, instance: _Instance) -> bool:
@@ -224,12 +204,12 @@ class MultiViewGeometry:
         taken = cv2.dilate(taken, np.ones((3, 3), np.uint8)) > 0
         found: list[_Instance] = []
         for component in evidence.components(evidence.moving_cells() & ~taken):
-            instance = self._judge(evidence, component & ~taken, ~taken)
-            if instance is None:
+            candidate = self._judge(evidence, component & ~taken, ~taken)
+            if candidate is None:
                 continue
-            taken |= instance.cells
-            if not self._joins_another(evidence, instance, known + found):
-                found.append(instance)
+            taken |= candidate.cells
+            if not self._joins_another(evidence, candidate, known + found):
+                found.append(candidate)
         seen_before = self._carry_found(evidence)
         count = np.zeros_like(self._found)
         confirmed = []
@@ -262,9 +242,7 @@ class MultiViewGeometry:
             return None
         return _Instance(0, UNNAMED_CLASS, evidence.score(motion), region, motion)
 
-    def _joins_another(
-        self, evidence: Evidence, part: _Instance, others: list[_Instance]
-    ) -> bool:
+    def _joins_another(self, evidence: Evidence, part: _Instance, others: list[_Instance]) -> bool:
         """Whether a region is a part of an instance beside it, which then takes it in."""
         near = cv2.dilate(part.cells.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         for other in others:

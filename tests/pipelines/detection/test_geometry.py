@@ -13,7 +13,8 @@ import pytest
 from pipelines.config import Config, GeometryConfig
 from pipelines.datasets import open_sequence
 from pipelines.datasets.sequence import Sequence
-from pipelines.detection.geometry import GeometryView, MultiViewGeometry
+from pipelines.detection.geometry import MultiViewGeometry
+from pipelines.detection.geometry_view import GeometryView
 from pipelines.dyob_slam import DyObSlam
 from pipelines.object_types import Detections
 from pipelines.types import Frame, StereoCamera, TrackingStatus
@@ -243,9 +244,10 @@ def test_bad_input_gives_no_false_instance(fault: str) -> None:
 
 def test_wrong_sizes_are_said() -> None:
     geometry = MultiViewGeometry(CAMERA, GeometryConfig())
-    view, _ = two_planes(0, 0.0)
+    view = replace(two_planes(0, 0.0)[0], flow_prev_to_curr_px=None)
     with pytest.raises(ValueError, match="disparity_px: expected shape"):
-        geometry.segment(replace(view, disparity_px=view.disparity_px[:100]), nothing())
+        smaller = {"gray": view.gray[:100], "disparity_px": view.disparity_px[:100]}
+        geometry.segment(replace(view, **smaller), nothing())
     with pytest.raises(ValueError, match="labels: expected shape"):
         geometry.segment(view, Detections.empty((10, 10)))
 
@@ -261,6 +263,7 @@ def run(sequence: Sequence, n: int, known_from_last: bool = True) -> list[Detect
     for k in range(n):
         frame: Frame = replace(sequence.read(k), instance_labels=None)
         prepared = slam.prepare(frame)
+        offset_px = np.float32(slam.sensor.offset.offset_px)
         result = slam.process(prepared)
         assert result.status is TrackingStatus.OK
         known = Detections.empty(prepared.gray.shape)
@@ -270,7 +273,7 @@ def run(sequence: Sequence, n: int, known_from_last: bool = True) -> list[Detect
             k,
             frame.timestamp_s,
             prepared.gray,
-            prepared.disparity_px,
+            prepared.disparity_px + offset_px,
             result.T_world_camera,
             result.pose_covariance,
             frame.flow_prev_to_curr_px,
