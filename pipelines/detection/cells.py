@@ -39,7 +39,7 @@ class CellGrid:
 
     @classmethod
     def of(cls, camera: StereoCamera, cell_px: int) -> CellGrid:
-        """The grid of a camera; an image smaller than one cell has an empty one."""
+        """The grid of a camera."""
         h, w = camera.height // cell_px, camera.width // cell_px
         middle = (cell_px - 1) / 2
         v, u = np.mgrid[:h, :w].astype(np.float32) * np.float32(cell_px) + np.float32(middle)

@@ -28,7 +28,7 @@ _MIN_LEFT = 0.1  # share of that distance before anything can be said
 _MAX_STILL_SHARE = 0.5  # of a region that older views saw in the same place: it stands
 _GAP_FACTOR = 1.5  # parts of one thing may lie farther apart in depth than cells of one surface
 _STILL = 0.7  # strength of flow below which a cell counts as still
-_MAX_COMPONENTS = 20  # the largest of a frame are judged
+_MAX_COMPONENTS = 12  # the largest of a frame are judged
 _AROUND_CELLS = 3  # width of the surroundings that are looked at, but for the first cell
 _SAME_SURFACE = 0.6  # share of the gap between things within which a surface goes on
 _MAX_GOES_ON = 0.35  # share of the cells around that are still, and of the same surface
@@ -165,11 +165,15 @@ class Evidence:
     def _extent_along(self, region: Bools, direction_m: Array) -> float:
         """Length in m of a region along a direction, without its outermost cells."""
         which = np.flatnonzero(region & np.isfinite(self.cells.disparity_px))
+        if len(which) == 0:
+            return 0.0
+        which = which[:: max(1, len(which) // 200)]
         depth = self.grid.camera.bf / self.cells.disparity_px.ravel()[which]
         points = self.grid.rays[:, which] * depth
         along = direction_m @ points / max(float(np.linalg.norm(direction_m)), 1e-9)
-        low, high = np.quantile(along, (0.05, 0.95))
-        return float(high - low)
+        along.sort()
+        rest = len(along) // 20
+        return float(along[-1 - rest] - along[rest])
 
     def is_patch(self, region: Bools) -> bool:
         """Whether a region is a piece of a still surface, that goes on beyond its border."""

@@ -69,6 +69,7 @@ class MultiViewGeometry:
         self._grid = CellGrid.of(camera, config.cell_px)
         self._memory = ViewMemory(config)
         self._last: tuple[GeometryView, DepthCells] | None = None
+        self._last_smooth = np.zeros((camera.height, camera.width), np.float32)
         self._last_static: Reference | None = None
         self._ground: Array | None = None
         self._found = np.zeros(self._grid.shape, np.float32)  # frames in a row, by cell
@@ -117,11 +118,11 @@ class MultiViewGeometry:
             for reference in self._memory.overlapping(*pose)
         ]
         flow, dt_s = None, 0.1
-        images: tuple[Floats, Floats] | None = None
+        smooth, images = _smooth(view.gray), None
         if self._last is not None and view.flow_prev_to_curr_px is not None:
             last, cells_before = self._last
             if view.frame_index - last.frame_index == 1:
-                images = (_smooth(view.gray), _smooth(last.gray))
+                images = (smooth, self._last_smooth)
                 dt_s = max(view.timestamp_s - last.timestamp_s, 1e-3)
                 T_last_this = invert_T(last.T_world_camera) @ view.T_world_camera
                 flow = flow_residuals(
@@ -135,6 +136,7 @@ class MultiViewGeometry:
                     dt_s,
                     config,
                 )
+        self._last_smooth = smooth
         return Evidence(grid, cells, flow, comparisons, usable, images, dt_s, sigma, config)
 
     def _remember(self, view: GeometryView, evidence: Evidence, instances: list[_Instance]) -> None:

@@ -11,6 +11,7 @@ from pipelines.detection.cells import CellGrid, Floats
 from pipelines.types import Array
 
 _SAMPLES = 400  # cells that a plane is scored on
+_MAX_CELLS = 3000  # that the plane is refined on
 _TRIALS = 120
 _TOLERANCE_SHARE = 0.03  # of the disparity, that the ground may be uneven by
 _MAX_TILT_DEG = 25.0  # of the ground against the camera
@@ -35,6 +36,8 @@ def fit_ground(
     lower, d = lower[seen], d[seen].astype(np.float64)
     if len(d) < 50:
         return None
+    thinned = slice(None, None, max(1, len(d) // _MAX_CELLS))
+    lower, d = lower[thinned], d[thinned]
     inverse = d / grid.camera.bf
     rays = grid.rays[:, lower].astype(np.float64).T
     sigma = sigma_px / grid.camera.bf
@@ -58,10 +61,8 @@ def fit_ground(
         agree = np.abs(inverse - rays @ plane) < tolerance
         if agree.sum() < 20:
             return None
-        weight = 1 / tolerance[agree]
-        plane = np.linalg.lstsq(rays[agree] * weight[:, None], inverse[agree] * weight, rcond=None)[
-            0
-        ]
+        weighted = rays[agree] / tolerance[agree, None] ** 2
+        plane = np.linalg.solve(weighted.T @ rays[agree], weighted.T @ inverse[agree])
     return plane if _is_level(plane[None])[0] else None
 
 
