@@ -71,6 +71,10 @@ class DepthCells:
     disparity_px: Floats
     edge: Bools
 
+    def shifted(self, offset_px: float) -> DepthCells:
+        """The same with `offset_px` added to all disparities."""
+        return DepthCells(self.disparity_px + np.float32(offset_px), self.edge)
+
 
 def reduce_disparity(grid: CellGrid, disparity_px: Floats, sigma_px: float) -> DepthCells:
     """Cells of a disparity map (H, W) with NaN where unknown and noise `sigma_px` a cell."""

@@ -8,7 +8,7 @@ difference: only a place that was seen *through* before and is filled now has so
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -32,17 +32,24 @@ _MEMORY_RECENT = 8
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """An older view, remembered.
+    """An older view, remembered, with disparities as measured.
 
-    timestamp_s. T_world_camera: (4, 4). disparity_px: (h, w) of its cells. nearest_px, farthest_px:
-    (h, w) float32, the largest and smallest disparity of each cell and its neighbours; infinite
-    and 0 next to unknown ones, where nothing can be said.
+    T_world_camera: (4, 4). nearest_px, farthest_px: (h, w) float32, the largest and smallest
+    disparity of each cell and its neighbours; both infinite next to unknown ones, where nothing
+    can be said, the latter below zero.
     """
 
     timestamp_s: float
     T_world_camera: Array
     nearest_px: Floats
     farthest_px: Floats
+
+    def shifted(self, offset_px: float) -> Reference:
+        """The same with `offset_px` added to all disparities."""
+        offset = np.float32(offset_px)
+        return replace(
+            self, nearest_px=self.nearest_px + offset, farthest_px=self.farthest_px + offset
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +70,7 @@ def make_reference(timestamp_s: float, T_world_camera: Array, cells: DepthCells)
     kernel = np.ones((3, 3), np.uint8)
     known = np.isfinite(cells.disparity_px)
     near = cv2.dilate(np.where(known, cells.disparity_px, np.float32(np.inf)), kernel)
-    far = cv2.erode(np.where(known, cells.disparity_px, np.float32(0)), kernel)
+    far = cv2.erode(np.where(known, cells.disparity_px, np.float32(-np.inf)), kernel)
     return Reference(
         timestamp_s, T_world_camera, np.asarray(near, np.float32), np.asarray(far, np.float32)
     )
@@ -153,7 +160,7 @@ def compare_places(
     )
     gap = noise + d * share / (1 + share)
     was_empty = (nearest < d - gap) & ~cells.edge
-    agrees = (nearest > d - gap) & (farthest < d + gap) & (farthest > 0)
+    agrees = (nearest > d - gap) & (farthest < d + gap) & np.isfinite(farthest)
     # A neighbourhood that spans both cannot say: only one whose own depths are alike can
     agrees &= np.isfinite(nearest) & (nearest - farthest < 2 * gap)
     return was_empty, agrees

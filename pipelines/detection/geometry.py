@@ -106,7 +106,9 @@ class MultiViewGeometry:
         """All tests of all cells against the frame before and older views."""
         grid, config = self._grid, self.config
         sigma = view.sigma_disparity_px
-        cells = reduce_disparity(grid, view.disparity_px, sigma)
+        measured = reduce_disparity(grid, view.disparity_px, sigma)
+        offset = view.disparity_offset_px
+        cells = measured.shifted(offset)
         usable = cells.disparity_px > self.camera.bf / config.max_range_m
         self._ground = fit_ground(grid, cells.disparity_px, self._ground, sigma)
         if self._ground is not None:
@@ -114,7 +116,7 @@ class MultiViewGeometry:
             usable &= height > config.ground_clearance_m
         pose = (view.timestamp_s, view.T_world_camera)
         comparisons: list[Comparison] = [
-            compare(grid, cells, reference, pose, sigma, config)
+            compare(grid, cells, reference.shifted(offset), pose, sigma, config)
             for reference in self._memory.overlapping(*pose)
         ]
         flow, dt_s = None, 0.1
@@ -128,7 +130,7 @@ class MultiViewGeometry:
                 flow = flow_residuals(
                     grid,
                     cells,
-                    cells_before,
+                    cells_before.shifted(offset),
                     static_places(grid, cells.disparity_px, T_last_this),
                     view.flow_prev_to_curr_px,
                     (max(view.sigma_flow_px, config.flow_sigma_px), sigma),
@@ -141,17 +143,18 @@ class MultiViewGeometry:
 
     def _remember(self, view: GeometryView, evidence: Evidence, instances: list[_Instance]) -> None:
         """Keep the view for later ones; what moves in it is left out, as it will be elsewhere."""
+        measured = evidence.cells.shifted(-view.disparity_offset_px)
         moving = np.zeros(self._grid.shape, np.uint8)
         for instance in instances:
             if instance.motion is not None:
                 moving |= instance.cells
         moving = cv2.dilate(moving, np.ones((3, 3), np.uint8))
-        still = np.where(moving > 0, np.float32(np.nan), evidence.cells.disparity_px)
+        still = np.where(moving > 0, np.float32(np.nan), measured.disparity_px)
         reference = make_reference(
-            view.timestamp_s, view.T_world_camera, DepthCells(still, evidence.cells.edge)
+            view.timestamp_s, view.T_world_camera, DepthCells(still, measured.edge)
         )
         self._memory.remember(reference)
-        self._last, self._last_static = (view, evidence.cells), reference
+        self._last, self._last_static = (view, measured), reference
 
     # -------------------------------------------------------------- instances
 
@@ -284,7 +287,7 @@ class MultiViewGeometry:
             window, pixels = paint(
                 self._grid,
                 instance.cells,
-                evidence.cells.disparity_px,
+                evidence.cells.disparity_px - np.float32(view.disparity_offset_px),
                 view.disparity_px,
                 self.config.depth_gap_share,
             )

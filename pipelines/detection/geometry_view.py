@@ -19,11 +19,12 @@ class GeometryView:
     """One frame with its pose, as geometry sees it.
 
     frame_index: by it is known whether the flow begins at the view segmented last. gray: (H, W)
-    uint8. disparity_px: (H, W) float32, corrected by the learned offset, NaN unknown.
+    uint8. disparity_px: (H, W) float32, as measured, NaN unknown.
     T_world_camera: (4, 4). pose_covariance: (6, 6) of the right perturbation [omega rad, v m]; NaN
     counts as none. flow_prev_to_curr_px: (H, W, 2) float32 on the pixels of the frame before, NaN
     unknown, or None. sigma_disparity_px, sigma_flow_px: standard deviations as learned by the
-    front-end, of disparities that are averaged over a few pixels and of flow.
+    front-end, of disparities that are averaged over a few pixels and of flow. disparity_offset_px:
+    true minus measured, as learned by now; it is applied to older views too, as it is learned late.
     """
 
     frame_index: int
@@ -35,6 +36,7 @@ class GeometryView:
     flow_prev_to_curr_px: NDArray[np.float32] | None
     sigma_disparity_px: float
     sigma_flow_px: float
+    disparity_offset_px: float = 0.0
 
     def __post_init__(self) -> None:
         check_shape("GeometryView", "disparity_px", self.disparity_px, (None, None))

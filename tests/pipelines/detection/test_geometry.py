@@ -143,6 +143,21 @@ def test_its_motion_is_measured_in_metres() -> None:
     assert motion.agreement > 0.9
 
 
+@pytest.mark.parametrize(("box_step_m", "expected"), [(0.0, 0), (0.24, 1)])
+def test_an_offset_learned_late_counts_for_older_views_too(
+    box_step_m: float, expected: int
+) -> None:
+    """Disparities that all measure 0.6 px short, which is known from the third frame on."""
+    short = 0.6
+    geometry = MultiViewGeometry(CAMERA, GeometryConfig())
+    for k in range(6):
+        view, _ = two_planes(k, box_step_m)
+        measured = view.disparity_px - np.float32(short)
+        view = replace(view, disparity_px=measured, disparity_offset_px=short if k > 1 else 0.0)
+        found = geometry.segment(view, nothing())
+        assert len(found) == expected or k < 2
+
+
 def test_older_views_saw_through_where_a_thing_is_now() -> None:
     geometry = MultiViewGeometry(CAMERA, GeometryConfig())
     for k in range(9):
@@ -263,7 +278,6 @@ def run(sequence: Sequence, n: int, known_from_last: bool = True) -> list[Detect
     for k in range(n):
         frame: Frame = replace(sequence.read(k), instance_labels=None)
         prepared = slam.prepare(frame)
-        offset_px = np.float32(slam.sensor.offset.offset_px)
         result = slam.process(prepared)
         assert result.status is TrackingStatus.OK
         known = Detections.empty(prepared.gray.shape)
@@ -273,12 +287,13 @@ def run(sequence: Sequence, n: int, known_from_last: bool = True) -> list[Detect
             k,
             frame.timestamp_s,
             prepared.gray,
-            prepared.disparity_px + offset_px,
+            prepared.disparity_px,
             result.T_world_camera,
             result.pose_covariance,
             frame.flow_prev_to_curr_px,
             slam.sensor.noise.sigma_disparity_px,
             slam.sensor.noise.sigma_uv_px["flow"],
+            slam.sensor.offset.offset_px,
         )
         found.append(geometry.segment(view, known))
         if result.is_keyframe:
