@@ -178,6 +178,43 @@ class FlowConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class GeometryConfig:
+    """Step 6: which pixels move, by depth and flow against the camera's motion, with no network."""
+
+    # auto: unless masks come with the sequence; it then repairs what networks see, and is all
+    # there is to the detector `motion`
+    use: Literal["auto", "always", "never"] = "auto"
+    cell_px: int = 4  # px, side of the cells that all is tested on; finer sees smaller things
+    significance: float = 3.5  # standard deviations of noise that a still thing may show
+    min_speed_mps: float = 0.15  # m/s, slower things count as still
+    max_speed_mps: float = 40.0  # m/s, along the view; faster is a mistake of flow
+    max_range_m: float = 60.0  # m, farther cells are not tested
+    flow_sigma_px: float = 0.3  # px, least standard deviation of dense flow, of any source
+    flow_error_share: float = 0.02  # of the ego-motion flow, which computed flow errs by
+    max_flow_miss_px: float = 1.0  # px, flow that leads back no better is not used
+    depth_gap_m: float = 0.4  # m, depths that differ by more are different things (DynaSLAM)
+    depth_gap_share: float = 0.06  # of the depth, the same for near or far things
+    n_references: int = 4  # older views compared with; DynaSLAM takes 5
+    reference_every: int = 2  # frames between recent views that are remembered
+    max_reference_distance_m: float = 25.0  # m, views from farther away are not compared with
+    max_parallax_deg: float = 30.0  # deg, nor cells seen from more than this apart (DynaSLAM)
+    min_cells: int = 10  # cells of a region, fewer are not reported
+    ground_clearance_m: float = 0.15  # m, things begin at this height above the ground
+    min_agreement: float = 0.6  # share of a region's cells that must move alike
+    confirm_frames: int = 2  # frames that must find a new thing before it is reported
+    min_score: float = 0.2  # nameless instances whose evidence fades below this are dropped
+
+    def __post_init__(self) -> None:
+        _check(self, cell_px=(1, 16), significance=(1, 20), min_speed_mps=(0, 100))
+        _check(self, max_speed_mps=(0.1, 1000))
+        _check(self, max_range_m=(0.5, 1000), flow_sigma_px=(0.001, 10), flow_error_share=(0, 0.5))
+        _check(self, max_flow_miss_px=(0.01, 100), depth_gap_m=(0.001, 10))
+        _check(self, depth_gap_share=(0.001, 0.5), n_references=(0, 20), reference_every=(1, 100))
+        _check(self, max_reference_distance_m=(0.1, 1000), max_parallax_deg=(1, 90))
+        _check(self, min_cells=(1, 10000), ground_clearance_m=(0, 1), min_agreement=(0, 1))
+        _check(self, confirm_frames=(1, 10), min_score=(0, 1))
+
+
 class ObjectsConfig:
     """Steps 5, 7, 8 and 9: which objects there are, which of them move, how, and how fast."""
 
@@ -221,6 +258,7 @@ class Config:
     depth: DepthConfig = field(default_factory=DepthConfig)
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     flow: FlowConfig = field(default_factory=FlowConfig)
+    geometry: GeometryConfig = field(default_factory=GeometryConfig)
     orb: OrbConfig = field(default_factory=OrbConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from pipelines.config import Config
 from pipelines.depth import StereoDepth
+from pipelines.detection.geometry import MultiViewGeometry
+from pipelines.detection.geometry_view import GeometryView
 from pipelines.errors import FrameError
 from pipelines.frontend.orb import OrbExtractor
 from pipelines.frontend.sensor import Sensor
@@ -28,7 +30,7 @@ from pipelines.object_types import ObjectEstimates
 from pipelines.objects.frame import ObjectFrame
 from pipelines.objects.tracking import ObjectTracker
 from pipelines.observations import Tracks
-from pipelines.perception import DenseFlow, Segmentation
+from pipelines.perception import FILES, DenseFlow, Segmentation
 from pipelines.types import (
     Array,
     Frame,
@@ -59,6 +61,7 @@ class DyObSlam:
         self._segmentation = Segmentation(self.config.detector)
         self._flow = DenseFlow(self.config.flow)
         self._objects = ObjectTracker(self.sensor, self.config.objects, self.config.tracking.seed)
+        self._geometry = MultiViewGeometry(camera, self.config.geometry)
         self._landmarks: set[int] = set()
         self._lost_frames = 0
         self._timings_ms: dict[str, float] = {}
@@ -80,6 +83,9 @@ class DyObSlam:
             view = view.masked(self._labels_that_move(objects, view), self._dilation_px)
         # 4. Camera pose
         tracked = self._track(view)
+        # 6. Multi-view geometry repairs masks, and finds what no detector knows
+        with self._stage("geometry"):
+            view = self._apply_geometry(prepared, view, tracked, objects)
         # 8, 9 and 5. Object motion, Kalman filters, what moves
         with self._stage("objects"):
             estimates = self._objects.estimate(
@@ -89,6 +95,8 @@ class DyObSlam:
         # 10. Sparse map
         with self._stage("mapping"):
             is_keyframe = self._grow_map(view, tracked)
+            if is_keyframe:
+                self._geometry.add_keyframe()
         self._timings_ms["total"] = sum(self._timings_ms.values())
         return self._result(prepared.frame, tracked, is_keyframe, estimates, objects)
 
@@ -192,6 +200,35 @@ class DyObSlam:
             return objects.labels
         landmarks = self._objects.landmark_ids(view.timestamp_s)
         return np.where(np.isin(objects.labels, landmarks), 0, objects.labels).astype(np.int32)
+
+    @property
+    def _uses_geometry(self) -> bool:
+        use = self.config.geometry.use
+        return use == "always" or (use == "auto" and self._segmentation.name != FILES)
+
+    def _apply_geometry(
+        self, prepared: PreparedFrame, view: View, tracked: TrackedFrame, objects: ObjectFrame
+    ) -> View:
+        """Step 6 on the frame's objects, which change; the view without what moves after all."""
+        if not self._uses_geometry or tracked.status is not TrackingStatus.OK:
+            return view
+        noise = self.sensor.noise
+        seen = GeometryView(
+            view.frame_index,
+            view.timestamp_s,
+            view.gray,
+            prepared.disparity_px,
+            tracked.T_world_camera,
+            tracked.covariance,
+            view.flow_prev_to_curr_px,
+            noise.sigma_disparity_px,
+            noise.sigma_uv_px["flow" if view.flow_is_given else "object_flow"],
+            self.sensor.offset.offset_px,
+        )
+        found = self._geometry.segment(seen, objects.detections(self._objects.class_names()))
+        names = self._objects.revise(view, objects, found, tracked.T_world_camera)
+        self._geometry.rename(names)
+        return view.masked(self._labels_that_move(objects, view), self._dilation_px)
 
     def _forget_landmarks(self, view: View, tracked: TrackedFrame, objects: ObjectFrame) -> None:
         """Parked cars that drive off take their points of the map with them."""

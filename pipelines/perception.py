@@ -21,6 +21,8 @@ from pipelines.flow import Flow, choose_flow, load_flow
 from pipelines.object_types import Detections
 from pipelines.types import Frame
 
+MOTION = "motion"  # the detector that is no network
+FILES = "files"
 _log = logging.getLogger("dyob.perception")
 
 
@@ -48,6 +50,8 @@ class Segmentation:
         if self._detector is None:
             self.name = choose_detector(self.config, frame.instance_labels is not None)
             self._detector = load_detector(replace(self.config, name=self.name))
+        if self.name == MOTION:  # no network: geometry does all the work, once the pose is known
+            return None
         turn = self._n_seen % self.config.every_n == 0
         self._n_seen += 1
         if not turn:

@@ -136,7 +136,7 @@ class SparseMap:
         self.n_found[found_ids] += 1
 
     def cull_points(self, tracked_ids: Ids, visible_ids: Ids) -> None:
-        """Forget points that proved no good: lost while young, or mostly not found where visible."""
+        """Forget points that proved no good: lost while young, or mostly not found."""
         tracked = np.zeros(self._size, bool)
         tracked[tracked_ids] = True
         self._young = self._young[self.n_keyframes[self._young] == 0]

@@ -34,7 +34,8 @@ class Candidates:
     """What speaks for each pair of J objects and M detections.
 
     votes: (J, M) how far the object's tracked points and the detection are the same, 0 without
-    points; see `count_votes`. n_points: (J,) tracked points. overlap: (J, M) of the predicted box with the detection's.
+    points; see `count_votes`. n_points: (J,) tracked points. overlap: (J, M) of the last box with
+    the detection's.
     distance2: (J, M) squared Mahalanobis distance of the centres, inf where unknown. log_spread:
     (J, M) logarithm of the determinant of its covariance: who may be anywhere is likely nowhere.
     color_distance: (J, M) Hellinger distance 0..1. same_kind: (J, M) whether classes agree.

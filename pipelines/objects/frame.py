@@ -44,10 +44,10 @@ class LastObjects:
 class ObjectFrame:
     """One frame on its way through the tracker, from `associate` to `estimate`.
 
-    labels: (H, W) int32 by lasting id. windows: id -> where its pixels are. scores: id -> of its
-    detection, 0 where the mask was carried. answered: whether there were detections at all. new_ids:
-    objects without points in the frame before. points, followed: tracked points of objects in
-    sight, with where they are now. noise_was_learned: whether their noise was known by then.
+    labels: (H, W) int32 by lasting id. answered: whether there were detections at all. points,
+    followed: tracked points of objects in sight, with where they are now. noise_was_learned:
+    whether their noise was known by then. windows: id -> where its pixels are. scores: id -> of its
+    detection, 0 where the mask was carried. new_ids: objects without points in the frame before.
     """
 
     labels: NDArray[np.int32]

@@ -93,8 +93,8 @@ def carry_missed(
 ) -> Window | None:
     """Paint the last mask of an object where its points went and no detection is.
 
-    followed: of all `last.points`. labels: (H, W), changed. Returns the mask's window, or None where
-    it cannot be carried: missed for too long, too few points, or hidden by others.
+    followed: of all `last.points`. labels: (H, W), changed. Returns the mask's window, or None
+    where it cannot be carried: missed for too long, too few points, or hidden by others.
     """
     before = last.mask(track.object_id)
     own = followed.valid & (last.points.object_id == track.object_id)

@@ -126,4 +126,4 @@ def direction_std(vector: Array, covariance: Array) -> float:
     if length < 1e-9:
         return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
     unit = vector / length
-    return float(np.sqrt(max(unit @ covariance @ unit, 0.0)))
+    return float(np.sqrt(max(float(unit @ covariance @ unit), 0.0)))

@@ -42,8 +42,8 @@ class Motions:
 
     object_id: (J,). Gs_curr_prev: (J, 4, 4), p_camera_curr = G @ p_camera_prev for their matter.
     covariances: (J, 6, 6) of the right perturbation [omega rad, v m] of inv(G), in the axes of the
-    present camera; NaN where not solved. n_points, n_inliers: (J,). inliers: (N,) bool of all points
-    in a row. residuals_px: (N, 3) of (u_L, v, u_R).
+    present camera; NaN where not solved. n_points, n_inliers: (J,). inliers: (N,) bool of all
+    points in a row. residuals_px: (N, 3) of (u_L, v, u_R).
     """
 
     object_id: NDArray[np.int64]

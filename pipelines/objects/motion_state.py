@@ -40,8 +40,8 @@ def decide_by_speed(
 def decide_by_scene_flow(config: ObjectsConfig, scene_flow_m: Array) -> ObjectState:
     """State by the scene flow vectors (N, 3) of an object's points, in m since the last frame.
 
-    Still if more than `scene_flow_share` of the points have less than `scene_flow_m` (paper, section
-    Object Motion Tracking; the share is VDO-SLAM's).
+    Still if more than `scene_flow_share` of the points have less than `scene_flow_m` (paper,
+    section Object Motion Tracking; the share is VDO-SLAM's).
     """
     if len(scene_flow_m) == 0:
         return ObjectState.UNKNOWN

@@ -13,7 +13,7 @@ from pipelines.config import ObjectsConfig
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
 from pipelines.geometry import MIN_DEPTH_M, backproject, invert_T, project_stereo, transform_points
-from pipelines.object_types import Detections, ObjectEstimates, ObjectState
+from pipelines.object_types import UNNAMED_CLASS, Detections, ObjectEstimates, ObjectState
 from pipelines.objects.following import Followed, follow_points
 from pipelines.objects.frame import LastObjects, ObjectFrame
 from pipelines.objects.identification import carry_missed, identify
@@ -140,7 +140,8 @@ class ObjectTracker:
             window, score = instances.windows[m], float(instances.scores[m])
             assert window is not None
             if scores is not None and object_id in scores:
-                score = scores[object_id]
+                nameless = str(instances.class_names[m]) == UNNAMED_CLASS
+                score = score if nameless else scores[object_id]
             else:
                 self.tracks[object_id].take_detection(
                     str(instances.class_names[m]), score, instances.colors[m]
