@@ -215,6 +215,7 @@ class GeometryConfig:
         _check(self, confirm_frames=(1, 10), min_score=(0, 1))
 
 
+@dataclass(frozen=True, slots=True)
 class ObjectsConfig:
     """Steps 5, 7, 8 and 9: which objects there are, which of them move, how, and how fast."""
 
