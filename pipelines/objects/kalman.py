@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from pipelines.geometry import rotation_of
 from pipelines.types import Array
 
 _MAX_TURN_RADPS = 1.0  # faster turns are noise of small objects, and would curl their prediction
@@ -65,8 +65,8 @@ class ObjectFilter:
 
     def predict(self, dt_s: float) -> None:
         """Move on by a time; the velocity turns at the rate last seen."""
-        R = Rotation.from_rotvec(self.turn_radps * dt_s).as_matrix()
-        half = Rotation.from_rotvec(self.turn_radps * (0.5 * dt_s)).as_matrix()
+        R = rotation_of(self.turn_radps * dt_s)
+        half = rotation_of(self.turn_radps * (0.5 * dt_s))
         F = np.eye(6)
         F[:3, 3:] = dt_s * half  # the chord of the arc
         F[3:, 3:] = R

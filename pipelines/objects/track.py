@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from pipelines.config import ObjectsConfig
 from pipelines.geometry import (
     invert_T,
     make_T,
     orthonormalise,
+    rotation_of,
     rotation_vector,
     skew,
     transform_points,
@@ -105,7 +105,7 @@ class ObjectTrack:
         center = self.filter.center_m
         if self.H_world_curr_prev is not None and self.H_dt_s > 0.0:
             return scale_about(self.H_world_curr_prev, center, dt_s / self.H_dt_s)
-        R = Rotation.from_rotvec(self.filter.turn_radps * dt_s).as_matrix()
+        R = rotation_of(self.filter.turn_radps * dt_s)
         return make_T(R, center + self.filter.velocity_mps * dt_s - R @ center)
 
     def expected_motion(self, center_m: Array, dt_s: float) -> tuple[Array, Array]:
