@@ -211,8 +211,8 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--provide",
         metavar="WHAT",
-        help="simulated sequences: which inputs come, of depth,flow,masks,right; 'right' alone is a "
-        "stereo camera and nothing else (default: depth,flow,masks)",
+        help="simulated sequences: which inputs come, of depth,flow,masks,right; 'right' alone is "
+        "a stereo camera and nothing else (default: depth,flow,masks)",
     )
     _add_settings(parser)
     _add_output(parser)

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import ModelError
-from pipelines.models import find_model, how_to_get
 from pipelines.flow.images import check_pair
+from pipelines.models import find_model, how_to_get
 from pipelines.types import Image
 
 if TYPE_CHECKING:
@@ -138,7 +138,8 @@ def _check_weights(weights: dict[str, Any], wanted: dict[str, Any], path: str | 
             break
     if faults:
         raise ModelError(
-            f"PWC-Net's weights {path} do not fit this network: {'; '.join(faults)}; {how_to_get(_MODEL)}"
+            f"PWC-Net's weights {path} do not fit this network: {'; '.join(faults)}; "
+            f"{how_to_get(_MODEL)}"
         )
 
 

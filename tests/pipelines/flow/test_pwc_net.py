@@ -197,7 +197,7 @@ def test_a_download_that_broke_off(pwc_weights, tmp_path) -> None:
 
 
 def test_a_missing_file_says_how_to_get_it(tmp_path) -> None:
-    words = "is missing; take .*models add pwc_net FILE.* --set flow.model=FILE"
+    words = "is missing; take .*models add pwc_net FILE.*--set flow.model=FILE"
     with pytest.raises(ModelError, match=words):
         load_flow(FlowConfig(name="pwc_net"))
     for path in (tmp_path / "nowhere.pth", tmp_path):
