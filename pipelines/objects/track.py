@@ -158,7 +158,12 @@ class ObjectTrack:
         return max(_SEEN_SIGMA_M, _PART_SHARE * float(np.nan_to_num(self.extent_m).max()))
 
     def take_center(self, center_m: Array) -> None:
-        """Take in where the middle (3,) of what is seen of it lies, where there is no motion."""
+        """Take in where the middle (3,) of what is seen of it lies, where there is no motion.
+
+        Of an object whose motion was measured a moment ago the prediction knows better.
+        """
+        if np.isfinite(self.H_covariance).all() and self.unmeasured_s <= _MAX_SLIP_S:
+            return
         covariance = self.center_sigma_m**2 * np.eye(3)
         if self.filter is None or self.T_world_object is None:
             self.filter = ObjectFilter(center_m, covariance, self.config.acceleration_mps2)
