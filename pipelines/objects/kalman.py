@@ -74,6 +74,13 @@ class ObjectFilter:
         G = np.vstack([0.5 * dt_s**2 * np.eye(3), dt_s * np.eye(3)])
         self._kf.predict(F=F, Q=self._acceleration**2 * G @ G.T)
 
+    def move_to(self, center_m: Array, covariance_m2: Array) -> None:
+        """Put the centre (3,) elsewhere, with a covariance (3, 3); the velocity stays."""
+        self._kf.x[:3] = center_m
+        self._kf.P[:3] = 0.0
+        self._kf.P[:, :3] = 0.0
+        self._kf.P[:3, :3] = covariance_m2
+
     def update_motion(
         self,
         center_m: Array,

@@ -84,6 +84,11 @@ class ObjectTrack:
         middle = 0.5 * (self.low_m + self.high_m)
         return self.T_world_object[:3, :3] @ middle + self.T_world_object[:3, 3]
 
+    @property
+    def _is_anchored(self) -> bool:
+        """Whether its pose is tied to its matter: its motion was measured a moment ago."""
+        return bool(np.isfinite(self.H_covariance).all()) and self.unmeasured_s <= _MAX_SLIP_S
+
     def velocity_at(self, point_m: Array) -> Array:
         """(3,) m/s of the object's matter at a point (3,) in the world, by the filter."""
         if self.filter is None:
@@ -134,8 +139,12 @@ class ObjectTrack:
 
     def take_motion(self, H: Array, covariance: Array, center_m: Array, dt_s: float) -> None:
         """Take a measured motion (4, 4) into filter and pose. covariance: about the centre (3,)."""
-        if self.T_world_object is None:
-            self.T_world_object = invert_T(H) @ make_T(np.eye(3), center_m)
+        if not self._is_anchored:
+            # So far the middle of a mask was all that was known, be it of what stood before it
+            R = np.eye(3) if self.T_world_object is None else self.T_world_object[:3, :3]
+            self.T_world_object = invert_T(H) @ make_T(H[:3, :3] @ R, center_m)
+            self.low_m, self.high_m = np.full(3, np.nan), np.full(3, np.nan)
+        assert self.T_world_object is not None
         before = self.T_world_object[:3, 3]
         self.T_world_object = orthonormalise(H @ self.T_world_object)
         origin = self.T_world_object[:3, 3].copy()
@@ -145,6 +154,8 @@ class ObjectTrack:
         loose = covariance_m2 + _CENTER_SIGMA_M**2 * np.eye(3)
         if self.filter is None:
             self.filter = ObjectFilter(origin, loose, self.config.acceleration_mps2)
+        elif not self._is_anchored:
+            self.filter.move_to(origin, loose)
         self.filter.update_motion(
             origin, loose, (origin - before) / dt_s, covariance_m2 / dt_s**2,
             rotation_vector(H) / dt_s,
@@ -162,7 +173,7 @@ class ObjectTrack:
 
         Of an object whose motion was measured a moment ago the prediction knows better.
         """
-        if np.isfinite(self.H_covariance).all() and self.unmeasured_s <= _MAX_SLIP_S:
+        if self._is_anchored:
             return
         covariance = self.center_sigma_m**2 * np.eye(3)
         if self.filter is None or self.T_world_object is None:
