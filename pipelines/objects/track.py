@@ -26,7 +26,7 @@ from pipelines.objects.motion import scale_about
 from pipelines.types import Array
 
 _COLOR_MEMORY = 0.8  # share of the old colours that each frame keeps
-_EXTENT_PERCENTILES = (4.0, 96.0)  # of the points, so that a stray one does not blow up the box
+_STRAY_SHARE = 0.04  # of the points at each end, left out so that strays do not blow up the box
 _GROWTH = 0.3  # of the way to them by which the box grows in a frame, for the same reason
 _SEEN_SIGMA_M = 1.0  # the middle of a mask, at its median depth
 _PART_SHARE = 0.35  # of its size, the same where a part of it may be hidden
@@ -213,7 +213,9 @@ class ObjectTrack:
         """Widen the box by the points (N, 3) seen now."""
         assert self.T_world_object is not None
         local = transform_points(invert_T(self.T_world_object), points_world_m)
-        low, high = np.percentile(local, _EXTENT_PERCENTILES, axis=0)
+        ordered = np.sort(local, axis=0)
+        left_out = int(_STRAY_SHARE * len(ordered))
+        low, high = ordered[left_out], ordered[-1 - left_out]
         if np.isnan(self.low_m).any():
             self.low_m, self.high_m = low, high
         self.low_m = self.low_m + _GROWTH * np.minimum(low - self.low_m, 0.0)
