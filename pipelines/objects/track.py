@@ -84,14 +84,29 @@ class ObjectTrack:
         middle = 0.5 * (self.low_m + self.high_m)
         return self.T_world_object[:3, :3] @ middle + self.T_world_object[:3, 3]
 
+    @property
+    def has_motion(self) -> bool:
+        """Whether a motion of it was ever measured, be it none at all."""
+        return self.H_dt_s > 0.0
+
     def velocity_at(self, point_m: Array) -> Array:
-        """(3,) m/s of the object's matter at a point (3,) in the world, by the filter."""
-        if self.filter is None:
+        """(3,) m/s of the object's matter at a point (3,) in the world, by the filter.
+
+        NaN before a motion was measured: middles of masks alone say little of a speed.
+        """
+        if self.filter is None or not self.has_motion:
             return np.full(3, np.nan)
         velocity = self.filter.velocity_mps
         if np.isfinite(point_m).all():
             velocity = velocity + np.cross(self.filter.turn_radps, point_m - self.filter.center_m)
         return velocity
+
+    @property
+    def velocity_std_mps(self) -> float:
+        """Standard deviation along the filter's velocity, NaN where that is not told."""
+        if self.filter is None or not self.has_motion:
+            return np.nan
+        return self.filter.speed_std_mps
 
     def is_landmark(self, timestamp_s: float) -> bool:
         """Whether it has been still for so long that it serves the camera as the world does."""
