@@ -211,9 +211,7 @@ def test_fewer_frames_than_asked_for_are_no_error(street, tmp_path) -> None:
     assert result.metrics["run"]["frames"] == 2
 
 
-def test_flow_between_frames_that_are_not_neighbours_is_not_used(
-    street, tmp_path, altered
-) -> None:
+def test_flow_between_frames_that_are_not_neighbours_is_not_used(street, tmp_path, altered) -> None:
     """The bytes are those of a run whose sequence brings flow for no frame at all."""
 
     def no_flow(frame: Frame) -> Frame:
