@@ -223,9 +223,8 @@ class ObjectsConfig:
     max_points: int = 200  # tracked points of one object
     min_points: int = 12  # fewer that agree with a motion do not prove it
     min_inlier_share: float = 0.4  # nor does a smaller share of the points measured
-    max_depth_m: float = (
-        25.0  # m, ThDepthObj (VDO-SLAM, KITTI): motions beyond are not told, 0 = any
-    )
+    # m, ThDepthObj (VDO-SLAM, KITTI): motions of things beyond are not told, 0 = any
+    max_depth_m: float = 25.0
     max_speed_std_mps: float = 1.5  # m/s, a less certain speed is not reported
     max_turn_std_deg: float = 0.7  # deg a frame, nor is a motion whose turn is less certain
     # speed: in m/s against its own uncertainty; scene_flow: the paper's threshold in m a frame

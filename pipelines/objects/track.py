@@ -87,16 +87,31 @@ class ObjectTrack:
     @property
     def _is_anchored(self) -> bool:
         """Whether its pose is tied to its matter: its motion was measured a moment ago."""
-        return bool(np.isfinite(self.H_covariance).all()) and self.unmeasured_s <= _MAX_SLIP_S
+        return self.has_motion and self.unmeasured_s <= _MAX_SLIP_S
+
+    @property
+    def has_motion(self) -> bool:
+        """Whether a motion of it was ever measured, be it none at all."""
+        return self.H_dt_s > 0.0
 
     def velocity_at(self, point_m: Array) -> Array:
-        """(3,) m/s of the object's matter at a point (3,) in the world, by the filter."""
-        if self.filter is None:
+        """(3,) m/s of the object's matter at a point (3,) in the world, by the filter.
+
+        NaN before a motion was measured: middles of masks alone say little of a speed.
+        """
+        if self.filter is None or not self.has_motion:
             return np.full(3, np.nan)
         velocity = self.filter.velocity_mps
         if np.isfinite(point_m).all():
             velocity = velocity + np.cross(self.filter.turn_radps, point_m - self.filter.center_m)
         return velocity
+
+    @property
+    def velocity_std_mps(self) -> float:
+        """Standard deviation along the filter's velocity, NaN where that is not told."""
+        if self.filter is None or not self.has_motion:
+            return np.nan
+        return self.filter.speed_std_mps
 
     def is_landmark(self, timestamp_s: float) -> bool:
         """Whether it has been still for so long that it serves the camera as the world does."""

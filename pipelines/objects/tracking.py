@@ -64,8 +64,13 @@ class ObjectTracker:
 
         detections: None where there is no answer for this frame. T_predicted: (4, 4) expected pose
         of the camera. Objects that are missed keep their masks, carried by flow, for a while;
-        detections that are no known object begin one.
+        detections that are no known object begin one. Where objects are not wanted, what was
+        detected is what it is, and nothing of it is remembered.
         """
+        if not self.config.enabled:
+            seen = Detections.empty(view.gray.shape) if detections is None else detections
+            nothing = ObjectPoints.empty(), Followed.empty()
+            return ObjectFrame(seen.labels, detections is not None, *nothing, False)
         dt_s = self._time_since_last(view)
         for track in self.tracks.values():
             if track.filter is not None:
@@ -234,8 +239,10 @@ class ObjectTracker:
 
         frame: what `associate` answered, perhaps revised. T_world_camera: (4, 4) with covariance
         (6, 6) as in `FrameResult`; NaN where it was only predicted: no motion is told then, nor in
-        the frame after.
+        the frame after. No rows where objects are not wanted.
         """
+        if not self.config.enabled:
+            return ObjectEstimates.empty()
         table = RowTable(view.frame_index, view.timestamp_s)
         for object_id in frame.windows:
             self.tracks[object_id].box_px = frame.box_px(object_id)
