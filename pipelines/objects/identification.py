@@ -98,7 +98,9 @@ def carry_missed(
     """
     before = last.mask(track.object_id)
     own = followed.valid & (last.points.object_id == track.object_id)
-    if before is None or own.sum() < _MIN_CARRIED_POINTS or track.missed_s > config.max_carried_s:
+    if before is None or own.sum() < _MIN_CARRIED_POINTS:
+        return None
+    if track.missed_s > config.max_carried_s or track.unconfirmed_s > config.max_age_s:
         return None
     carried = carry_mask(*before, last.points.uv_px[own], followed.uv_px[own], labels.shape)
     if carried is None:

@@ -42,10 +42,11 @@ class ObjectTrack:
 
     filter, T_world_object: None until something of it has a depth; the filter follows the origin
     of the pose. H_world_curr_prev: last measured motion, over `H_dt_s`, with covariance (6, 6);
-    None where the last frame measured none. seen_s: when it was last in view. missed_s: for how
-    long detections have gone without it. still_since_s: None unless stopped. box_px, area_px,
-    color: of its last mask. low_m, high_m: (3,) box around its points in the axes of its pose, NaN
-    where the pose was not measured; extent_m: (3,) its size, also after that.
+    None where the last frame measured none, `unmeasured_s` ago. seen_s: when it was last in view.
+    missed_s: for how long detections have gone without it; unconfirmed_s: the same, frames without
+    any detections counted. still_since_s: None unless stopped. box_px, area_px, color: of its last
+    mask. low_m, high_m: (3,) box around its points in the axes of its pose, NaN where that is not
+    known; extent_m: (3,) its size, also after that.
     """
 
     object_id: int
@@ -59,6 +60,7 @@ class ObjectTrack:
     H_covariance: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
     seen_s: float = 0.0
     missed_s: float = 0.0
+    unconfirmed_s: float = 0.0
     unmeasured_s: float = 0.0
     still_since_s: float | None = None
     box_px: Array = field(default_factory=lambda: np.full(4, np.nan))
@@ -85,7 +87,7 @@ class ObjectTrack:
         return self.T_world_object[:3, :3] @ middle + self.T_world_object[:3, 3]
 
     @property
-    def _is_anchored(self) -> bool:
+    def is_anchored(self) -> bool:
         """Whether its pose is tied to its matter: its motion was measured a moment ago."""
         return self.has_motion and self.unmeasured_s <= _MAX_SLIP_S
 
@@ -150,11 +152,11 @@ class ObjectTrack:
         self.scores[name] = self.scores.get(name, 0.0) + max(score, 1e-3)
         share = _COLOR_MEMORY if self.color.any() else 0.0
         self.color = share * self.color + (1.0 - share) * color
-        self.missed_s = 0.0
+        self.missed_s = self.unconfirmed_s = 0.0
 
     def take_motion(self, H: Array, covariance: Array, center_m: Array, dt_s: float) -> None:
         """Take a measured motion (4, 4) into filter and pose. covariance: about the centre (3,)."""
-        if not self._is_anchored:
+        if not self.is_anchored:
             # So far the middle of a mask was all that was known, be it of what stood before it
             R = np.eye(3) if self.T_world_object is None else self.T_world_object[:3, :3]
             self.T_world_object = invert_T(H) @ make_T(H[:3, :3] @ R, center_m)
@@ -169,7 +171,7 @@ class ObjectTrack:
         loose = covariance_m2 + _CENTER_SIGMA_M**2 * np.eye(3)
         if self.filter is None:
             self.filter = ObjectFilter(origin, loose, self.config.acceleration_mps2)
-        elif not self._is_anchored:
+        elif not self.is_anchored:
             self.filter.move_to(origin, loose)
         self.filter.update_motion(
             origin, loose, (origin - before) / dt_s, covariance_m2 / dt_s**2,
@@ -188,7 +190,7 @@ class ObjectTrack:
 
         Of an object whose motion was measured a moment ago the prediction knows better.
         """
-        if self._is_anchored:
+        if self.is_anchored:
             return
         covariance = self.center_sigma_m**2 * np.eye(3)
         if self.filter is None or self.T_world_object is None:

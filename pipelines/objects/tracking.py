@@ -96,7 +96,7 @@ class ObjectTracker:
         self._paint(frame, instances, found)
         for object_id in known:
             if object_id not in found:
-                self._carry(frame, object_id, dt_s if answered else 0.0)
+                self._carry(frame, object_id, dt_s)
         self._keep_points_in_sight(frame)
         return frame
 
@@ -150,6 +150,8 @@ class ObjectTracker:
             if scores is not None and object_id in scores:
                 nameless = str(instances.class_names[m]) == UNNAMED_CLASS
                 score = score if nameless else scores[object_id]
+                if nameless:  # geometry drops what it does not see
+                    self.tracks[object_id].unconfirmed_s = 0.0
             else:
                 self.tracks[object_id].take_detection(
                     str(instances.class_names[m]), score, instances.colors[m]
@@ -158,10 +160,12 @@ class ObjectTracker:
         frame.labels = table[instances.labels]
         return [int(i) for i in table[1:]]
 
-    def _carry(self, frame: ObjectFrame, object_id: int, missed_s: float) -> None:
+    def _carry(self, frame: ObjectFrame, object_id: int, dt_s: float) -> None:
         """Go on with the mask of an object that this frame's detections lack."""
         track = self.tracks[object_id]
-        track.missed_s += missed_s
+        track.unconfirmed_s += dt_s
+        if frame.answered:
+            track.missed_s += dt_s
         if self._last is None:
             return
         window = carry_missed(self.config, track, self._last, frame.followed, frame.labels)
@@ -461,7 +465,7 @@ class ObjectTracker:
             center = transform_points(T_world_camera, backproject(self.camera, uv, z))[0]
             if len(v) >= _MOSTLY_SEEN * track.area_px:  # else something is passing before it
                 track.take_center(center)
-        if track.state is not ObjectState.STOPPED:
+        if track.state is not ObjectState.STOPPED or not track.is_anchored:
             track.set_state(ObjectState.UNKNOWN, view.timestamp_s)
         table.add(track, frame.scores[track.object_id], center_m=center)
 
