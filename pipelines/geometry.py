@@ -6,6 +6,8 @@ the paper. Knows no images.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -105,10 +107,24 @@ def rotation_vector(T: Array) -> Array:
 
 
 def rotation_of(rotation_vector_rad: Array) -> Array:
-    """Rotations (..., 3, 3) of rotation vectors (..., 3) in rad."""
-    v = np.zeros((*rotation_vector_rad.shape[:-1], 6))
-    v[..., :3] = rotation_vector_rad
-    return exp_se3(v)[..., :3, :3]
+    """Rotation (3, 3) of a rotation vector (3,) in rad, by Rodrigues' formula.
+
+    In plain numbers: for one small matrix that is ten times as fast as in arrays.
+    """
+    x, y, z = rotation_vector_rad.tolist()
+    angle2 = x * x + y * y + z * z
+    if angle2 < 1e-16:
+        a, b = 1.0, 0.5
+    else:
+        angle = math.sqrt(angle2)
+        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle2
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
+        ]
+    )
 
 
 def q_xyzw_from_T(T: Array) -> Array:

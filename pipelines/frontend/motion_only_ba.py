@@ -103,6 +103,7 @@ def estimate_poses(
     sizes: NDArray[np.int64],
     robust_rounds: int = 2,
     gate_px: float = np.inf,
+    max_steps: int = _MAX_ITERATIONS,
 ) -> PoseEstimates:
     """Poses (J, 4, 4) that minimise the reprojection error of each body, eqs. (1) and (3).
 
@@ -114,6 +115,7 @@ def estimate_poses(
     which eliminates the points, and the error of the measured flow, exactly to first order (what
     VDO-SLAM calls the joint refinement of flow and pose). Observations more than `gate_px` from the
     guess join after the first round: many that move alike would drag even a robust cost along.
+    max_steps: of each round, for all bodies; the slowest holds up the rest.
     """
     Ts = Ts_body_camera
     problem = _Problem(camera, Ts, observations, sizes)
@@ -123,12 +125,12 @@ def estimate_poses(
     for round_index in range(robust_rounds):
         if round_index > 0:
             problem = _Problem(camera, Ts, observations, sizes)
-        Ts = problem.minimise(Ts, used, robust=True)
+        Ts = problem.minimise(Ts, used, True, max_steps)
         problem.allow_for_noise(Ts)
         used = problem.chi2(Ts) <= problem.limit
         if (problem.count(used) < _MIN_POINTS).all():
             break
-    Ts = problem.minimise(Ts, used, robust=False)
+    Ts = problem.minimise(Ts, used, False, max_steps)
     residuals, chi2 = problem.residuals(Ts), problem.chi2(Ts)
     used = chi2 <= problem.limit
     n_inliers = problem.count(used)
@@ -317,7 +319,7 @@ class _Problem:
             g[j] = w @ e[:, body].ravel()
         return H, g
 
-    def minimise(self, Ts: Array, used: NDArray[np.bool_], robust: bool) -> Array:
+    def minimise(self, Ts: Array, used: NDArray[np.bool_], robust: bool, max_steps: int) -> Array:
         """Levenberg-Marquardt (paper) from `Ts` (J, 4, 4) with a fixed set of observations.
 
         Each body has its own damping, and stops on its own.
@@ -327,7 +329,7 @@ class _Problem:
         going = np.ones(len(Ts), bool)
         cost = self.cost(Ts, used, robust)
         H, g = self.normal_equations(Ts, used, robust)
-        for _ in range(_MAX_ITERATIONS):
+        for _ in range(max_steps):
             diagonal = damping[:, None] * np.diagonal(H, axis1=1, axis2=2) + 1e-9
             step = np.linalg.solve(H + diagonal[:, :, None] * np.eye(6), g[..., None])[..., 0]
             going &= np.isfinite(step).all(axis=1)

@@ -6,6 +6,7 @@ Owns the reading of masks. Knows no tracks.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -71,12 +72,18 @@ def describe_instances(
         disparity = disparity_px[v, u]
         known = disparity > 0
         if known.any():
-            middle = np.median(disparity[known])
-            uv = np.array([[np.median(u), np.median(v)]])
-            centers[m] = backproject(camera, uv, np.array([camera.bf / middle]))[0]
+            uv = np.array([[middle_of(u), middle_of(v)]], float)
+            z = camera.bf / np.array([middle_of(disparity[known])], float)
+            centers[m] = backproject(camera, uv, z)[0]
     return Instances(
         labels, windows, boxes, centers, colors, detections.class_names, detections.scores
     )
+
+
+def middle_of(values: NDArray[Any]) -> Any:
+    """The median of N > 0 values, the upper of the two middle ones: a fifth of numpy's time."""
+    half = len(values) // 2
+    return np.partition(values, half)[half]
 
 
 def _some_pixels(

@@ -28,6 +28,7 @@ from pipelines.types import Array, StereoCamera
 
 _INLIER_PX = 2.0  # reprojection error of an inlier of a motion hypothesis
 _GATE = 2.0  # inlier limits: observations farther from the chosen hypothesis join later
+_MAX_STEPS = 5  # of Levenberg-Marquardt: the guesses are good to some pixels
 _WEAK_SHARE = 0.7  # of inliers, below which PnP RANSAC competes
 _MIN_PNP_POINTS = 8
 GATE_6DOF = 16.8  # chi-square, 6 degrees of freedom, 99 %
@@ -91,6 +92,7 @@ def estimate_motions(
         sizes,
         robust_rounds=1,
         gate_px=_GATE * _INLIER_PX,
+        max_steps=_MAX_STEPS,
     )
     return Motions(
         ids,

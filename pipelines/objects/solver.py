@@ -18,6 +18,7 @@ from pipelines.frontend.sensor import Sensor
 from pipelines.geometry import MIN_DEPTH_M, invert_T, project_stereo, transform_points
 from pipelines.mapping.point_filter import refine_points
 from pipelines.objects.following import Followed
+from pipelines.objects.instances import middle_of
 from pipelines.objects.motion import Motions, estimate_motions, move_points
 from pipelines.objects.points import ObjectPoints, create_points
 from pipelines.observations import StereoObservations
@@ -164,8 +165,8 @@ def on_one_surface(
     for n in points.groups()[1]:
         rows = slice(end, end + int(n))
         end = rows.stop
-        middle = np.median(disparity[rows])
+        middle = middle_of(disparity[rows])
         away = np.abs(disparity[rows] - middle)
-        limit = max(_SPREAD * np.median(away), _RELATIVE_SPREAD * middle) + 3.0 * sigma_disparity_px
+        limit = max(_SPREAD * middle_of(away), _RELATIVE_SPREAD * middle) + 3.0 * sigma_disparity_px
         near[rows] = away <= limit
     return near

@@ -27,10 +27,11 @@ from pipelines.types import Array
 
 _COLOR_MEMORY = 0.8  # share of the old colours that each frame keeps
 _STRAY_SHARE = 0.04  # of the points at each end, left out so that strays do not blow up the box
-_GROWTH = 0.3  # of the way to them by which the box grows in a frame, for the same reason
+_GROWTH = 0.6  # of the way to them by which the box grows in a frame, for the same reason
 _SEEN_SIGMA_M = 1.0  # the middle of a mask, at its median depth
 _PART_SHARE = 0.35  # of its size, the same where a part of it may be hidden
 _SHRINKING = 0.98  # share of its size that it keeps from frame to frame at least
+_LEAST_SPEED_MPS = 0.1  # m/s over ground, of a velocity that has a direction
 _MAX_SLIP_S = 0.5  # s without a measured motion after which nobody knows where its box is
 _CENTER_SIGMA_M = 0.3  # the filter's centre is held this loosely: its model is not the matter's
 _FASTEST_RADPS, _FASTEST_MPS = 2.0, 20.0  # standard deviations of motions not yet known
@@ -46,7 +47,8 @@ class ObjectTrack:
     missed_s: for how long detections have gone without it; unconfirmed_s: the same, frames without
     any detections counted. still_since_s: None unless stopped. box_px, area_px, color: of its last
     mask. low_m, high_m: (3,) box around its points in the axes of its pose, NaN where that is not
-    known; extent_m: (3,) its size, also after that.
+    known; extent_m: (3,) its size, also after that. is_oriented: whether its x axis was laid along
+    its motion.
     """
 
     object_id: int
@@ -65,6 +67,7 @@ class ObjectTrack:
     still_since_s: float | None = None
     box_px: Array = field(default_factory=lambda: np.full(4, np.nan))
     area_px: int = 0
+    is_oriented: bool = False
     color: Array = field(default_factory=lambda: np.zeros(64))
     low_m: Array = field(default_factory=lambda: np.full(3, np.nan))
     high_m: Array = field(default_factory=lambda: np.full(3, np.nan))
@@ -225,6 +228,24 @@ class ObjectTrack:
         elif self.still_since_s is None:
             self.still_since_s = timestamp_s
         self.state = state
+
+    def orient(self) -> None:
+        """Turn the pose's x axis along the velocity, once: a box along a car's sides is its own.
+
+        Of a box across them the middle of what is seen lies off the middle of the car.
+        """
+        if self.is_oriented or self.filter is None or self.T_world_object is None:
+            return
+        self.is_oriented = True
+        forward = self.filter.velocity_mps * (1.0, 0.0, 1.0)  # level: the world's y points down
+        length = float(np.linalg.norm(forward))
+        if length < _LEAST_SPEED_MPS:
+            return
+        x, _, z = forward / length
+        self.T_world_object = make_T(
+            np.array([[x, 0.0, -z], [0.0, 1.0, 0.0], [z, 0.0, x]]), self.T_world_object[:3, 3]
+        )
+        self.low_m, self.high_m = np.full(3, np.nan), np.full(3, np.nan)
 
     def take_points(self, points_world_m: Array) -> None:
         """Widen the box by the points (N, 3) seen now."""

@@ -368,6 +368,8 @@ class ObjectTracker:
         else:
             state = self._state_by_speed(track, covariance, spread_m, std_mps, dt_s)
         track.set_state(state, view.timestamp_s)
+        if state is ObjectState.MOVING:
+            track.orient()
         score = frame.scores[track.object_id]
         depth_m = float(np.median(points.position_m[:, 2]))
         if 0.0 < self.config.max_depth_m < depth_m:
