@@ -19,7 +19,7 @@ from pipelines.frontend.sampling import sample_disparity
 from pipelines.mapping.point_filter import make_points
 from pipelines.types import Array, Image, StereoCamera
 
-Window = tuple[slice, slice]
+Window = tuple[slice, slice]  # rows and columns of an image
 _CORNER_WINDOW_PX = 5  # of the structure tensor that ranks pixels
 _MIN_CELL_PX, _MAX_CELL_PX = 2, 12
 _SIGMA_NEW_UV_PX = 0.05  # px, small: a point is by definition where it was first seen
@@ -92,7 +92,7 @@ def choose_pixels(
     gray: (H, W) the whole image. mask: (h, w) the object inside `window`. n_all: points that the
     whole object should have. occupied_px: (K, 2) those it has, whose cells are taken already.
     """
-    inner = _without_rim(mask)
+    inner = _without_rim(mask, window, gray.shape)
     n_pixels, n = int(np.count_nonzero(inner)), n_all - len(occupied_px)
     if n_pixels == 0 or n <= 0:
         return np.empty((0, 2))
@@ -122,11 +122,25 @@ def choose_pixels(
     return uv.astype(np.float64)
 
 
-def _without_rim(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _without_rim(
+    mask: NDArray[np.bool_], window: Window, shape: tuple[int, ...]
+) -> NDArray[np.bool_]:
+    """The mask (h, w) less its rim; where the image (H, W) ends it has none, as it may go on."""
     n_pixels = np.count_nonzero(mask)
-    for least, rim_px in _RIM_PX:
-        if n_pixels >= least:
-            size = 2 * rim_px + 1
-            kernel = np.ones((size, size), np.uint8)
-            return cv2.erode(mask.astype(np.uint8), kernel, borderValue=1) > 0
-    return mask
+    rim_px = next((rim for least, rim in _RIM_PX if n_pixels >= least), 0)
+    if rim_px == 0:
+        return mask
+    around = tuple(
+        (rim_px * (part.start > 0), rim_px * (part.stop < length))
+        for part, length in zip(window, shape, strict=True)
+    )
+    padded = np.pad(mask.astype(np.uint8), around)
+    inner = cv2.erode(padded, np.ones((2 * rim_px + 1,) * 2, np.uint8), borderValue=1) > 0
+    (top, _), (left, _) = around
+    return inner[top : top + mask.shape[0], left : left + mask.shape[1]]
+
+
+def tight_window(mask: NDArray[np.bool_]) -> Window:
+    """Where the pixels of a mask (h, w) lie in it. It must have some."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
