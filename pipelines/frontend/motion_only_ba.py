@@ -125,8 +125,6 @@ def estimate_poses(
         Ts = problem.minimise(Ts, used, robust=True)
         problem.allow_for_noise(Ts)
         used = problem.chi2(Ts) <= problem.limit
-        if (problem.count(used) < _MIN_POINTS).all():
-            break
     Ts = problem.minimise(Ts, used, robust=False)
     residuals, chi2 = problem.residuals(Ts), problem.chi2(Ts)
     used = chi2 <= problem.limit

@@ -60,7 +60,8 @@ def test_a_motion_is_believed_and_its_points_are_refined(kitti, solver):
     assert len(refined) == solution.motions.n_inliers[0] > 60
     assert abs(np.median(refined.position_m[:, 2]) - 11.5) < 0.05
     before, after = (np.trace(p.covariance_m2, axis1=1, axis2=2) for p in (points, refined))
-    assert 0.3 < np.median(after) / np.median(before) < 0.95  # a second look at their depths
+    # A second look at their depths, and 0.3 m of parallax besides
+    assert 0.05 < np.median(after) / np.median(before) < 0.5
 
 
 @pytest.mark.parametrize(("n_agree", "believed"), [(11, False), (30, False), (50, True)])
