@@ -294,9 +294,7 @@ def bodies(rng, sizes):
     parts = [observe(rng, n, point_noise=0.02) for n in sizes]
     parts = [without_disparity(part, rng.random(len(part)) < 0.3) for part in parts]
     guesses = np.stack([GUESS @ exp_se3(rng.normal(0, 0.01, 6)) for _ in sizes])
-    alone = [
-        estimate_camera_pose(CAMERA, T, part) for T, part in zip(guesses, parts, strict=True)
-    ]
+    alone = [estimate_camera_pose(CAMERA, T, part) for T, part in zip(guesses, parts, strict=True)]
     return parts, guesses, alone
 
 

@@ -140,8 +140,10 @@ class Street:
             if row == 0:
                 texture = np.tile(texture, (6, 8))
             h, w = texture.shape
-            metres = np.array([[board.size_m[0] / w, 0, -board.size_m[0] / 2],
-                               [0, board.size_m[1] / h, -board.size_m[1] / 2], [0, 0, 1]])  # fmt: skip
+            width_m, height_m = board.size_m
+            metres = np.array(
+                [[width_m / w, 0, -width_m / 2], [0, height_m / h, -height_m / 2], [0, 0, 1]]
+            )
             warped = cv2.warpAffine(
                 texture, A @ metres, (W, H), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
             )

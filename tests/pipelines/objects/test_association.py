@@ -48,9 +48,7 @@ def test_a_lost_object_is_found_again_within_its_gate():
     c = candidates([[0.0, 0.0]], n_points=[0], distance2=[[9.0, 2.0]])
     np.testing.assert_array_equal(assign(c), [1])
     # At the same distance the one of its colour is it
-    c = candidates(
-        [[0.0, 0.0]], n_points=[0], distance2=[[3.0, 3.0]], color_distance=[[0.1, 0.5]]
-    )
+    c = candidates([[0.0, 0.0]], n_points=[0], distance2=[[3.0, 3.0]], color_distance=[[0.1, 0.5]])
     np.testing.assert_array_equal(assign(c), [0])
 
 

@@ -49,13 +49,13 @@ def test_flow_that_leads_elsewhere_than_expected_is_not_of_the_object():
 
 
 def test_where_both_contradict_the_one_nearer_to_the_expected_is_believed():
-    wrong_flow = SHIFT + (5.0, 0.0)
-    for expected, right in ((SHIFT, SHIFT), (SHIFT + (4.5, 0.0), wrong_flow)):
+    wrong_flow = SHIFT + np.array([5.0, 0.0])
+    for expected, right in ((SHIFT, SHIFT), (SHIFT + np.array([4.5, 0.0]), wrong_flow)):
         found = follow(flow(wrong_flow), UV + expected)
         error = np.linalg.norm(found.uv_px - UV - right, axis=1)[found.valid]
         assert np.median(error) < 0.1
     # Without any expectation the alignment starts at the flow, and finds its way from there
-    found = follow(flow(SHIFT + (1.0, 0.0)), NOWHERE)
+    found = follow(flow(SHIFT + np.array([1.0, 0.0])), NOWHERE)
     assert np.median(np.linalg.norm(found.aligned_px - UV - SHIFT, axis=1)) < 0.05
 
 

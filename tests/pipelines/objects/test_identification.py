@@ -72,7 +72,7 @@ def test_an_object_is_found_again_by_its_filter_in_the_world(kitti):
     T[2, 3] = 2.0
     for row in range(2):
         center = seen.centers_m[row] + [0, 0, 2.0]
-        tracks = {5: track_at(5, center_m=center + [0.4, 0.0, 0.3])}
+        tracks = {5: track_at(5, center_m=center + np.array([0.4, 0.0, 0.3]))}
         assert identify(tracks, seen, *NO_POINTS, T) == {5: row}
     nearby = {5: track_at(5, center_m=seen.centers_m[0] + [0, 12.0, 2.0])}
     assert identify(nearby, seen, *NO_POINTS, T) == {}

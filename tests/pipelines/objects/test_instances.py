@@ -73,7 +73,7 @@ def test_colours_tell_things_apart_whatever_the_exposure(kitti):
     image = np.zeros((*SHAPE, 3), np.uint8)
     red, dark_red, blue = (np.s_[0:40, 40 * i : 40 * i + 40] for i in range(3))
     base = rng.integers(0, 40, (40, 40, 3))
-    image[red], image[blue] = base + [160, 40, 40], base + [40, 40, 160]
+    image[red], image[blue] = base + np.array([160, 40, 40]), base + np.array([40, 40, 160])
     image[dark_red] = 0.7 * image[red]
     found = describe_instances(
         kitti, image, np.ones(SHAPE, np.float32), detections(red, dark_red, blue)
@@ -143,7 +143,7 @@ def test_points_that_do_not_move_together_carry_nothing():
     uv, rng = grid(*window), np.random.default_rng(1)
     mask = np.ones((40, 60), bool)
     assert carry_mask(mask, window, uv, rng.uniform(0, 100, uv.shape), SHAPE) is None
-    few_stray = uv + (5.0, 0.0)
+    few_stray = uv + np.array([5.0, 0.0])
     few_stray[::4] += rng.uniform(20, 60, few_stray[::4].shape)
     carried = carry_mask(mask, window, uv, few_stray, SHAPE)
     assert carried is not None and carried[1][1].start == 75

@@ -1,5 +1,7 @@
 """The filter of one object against simulated paths: consistency, coasting, turning, wild input."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -24,7 +26,7 @@ def feed(rng, centers, turn_radps, acceleration_mps2=3.0):
     P = CENTER_SIGMA_M**2 * np.eye(3)
     V = VELOCITY_SIGMA_MPS**2 * np.eye(3)
     kf = ObjectFilter(centers[0] + rng.normal(size=3) * CENTER_SIGMA_M, P, acceleration_mps2)
-    for before, now in zip(centers, centers[1:], strict=False):
+    for before, now in pairwise(centers):
         kf.predict(DT_S)
         kf.update_motion(
             now + rng.normal(size=3) * CENTER_SIGMA_M,
@@ -88,7 +90,7 @@ def test_an_exact_circle_is_predicted_without_error():
     centers = path(60, 8.0, 0.4)
     kf = ObjectFilter(centers[0], 1e-6 * np.eye(3), 3.0)
     tiny = 1e-8 * np.eye(3)
-    for before, now in zip(centers[:-1], centers[1:-1], strict=False):
+    for before, now in pairwise(centers[:-1]):
         kf.predict(DT_S)
         kf.update_motion(now, tiny, (now - before) / DT_S, tiny, turn_radps=axis, dt_s=DT_S)
     kf.predict(DT_S)

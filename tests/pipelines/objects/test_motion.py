@@ -1,4 +1,4 @@
-"""Motions of boxes of points against their truth: precision, claimed covariance, outliers, speed."""
+"""Motions of boxes of points against their truth: precision, covariance, outliers, speed."""
 
 from dataclasses import replace
 
@@ -96,7 +96,7 @@ def test_pnp_takes_over_where_both_hypotheses_are_wrong(kitti, body, twist_betwe
             yield np.linalg.norm(twist_error(twist_between, fast.G, motions)[3:])
 
     with_pnp = list(errors_m())
-    assert 1e-4 < np.median(with_pnp) and max(with_pnp) < 0.05
+    assert np.median(with_pnp) > 1e-4 and max(with_pnp) < 0.05
     monkeypatch.setattr("pipelines.objects.motion._WEAK_SHARE", 0.0)  # it never competes
     assert np.median(list(errors_m())) > 1.0
 
@@ -153,7 +153,7 @@ def test_motion_in_the_world_moves_world_points():
     H = exp_se3(np.array([0.01, 0.1, 0.0, 0.3, 0.0, 1.2]))
     G = invert_T(T_CURR) @ H @ T_PREV
     np.testing.assert_allclose(motion_in_world(G, T_CURR, T_PREV), H, atol=1e-12)
-    points = np.random.default_rng(8).normal(size=(5, 3)) + [0, 0, 10.0]
+    points = np.random.default_rng(8).normal(size=(5, 3)) + np.array([0, 0, 10.0])
     moved = move_points(np.stack([G, np.eye(4)]), np.r_[points, points], np.array([5, 5]))
     np.testing.assert_allclose(
         transform_points(T_CURR, moved[:5]), transform_points(H @ T_PREV, points), atol=1e-9

@@ -1,5 +1,7 @@
 """Who moves: the rule in m/s with its hysteresis, and the paper's by scene flow."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -48,7 +50,7 @@ def test_a_car_that_brakes_and_starts_changes_state_twice():
     for speed in speeds:
         state = decide_by_speed(CONFIG, state, speed, 0.05)
         states.append(state)
-    changes = [(a, b) for a, b in zip(states, states[1:], strict=False) if a is not b]
+    changes = [(a, b) for a, b in pairwise(states) if a is not b]
     assert changes == [(MOVING, STOPPED), (STOPPED, MOVING)]
 
 

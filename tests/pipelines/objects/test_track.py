@@ -160,7 +160,7 @@ def test_the_box_ignores_a_stray_point_and_grows_gradually():
 def test_velocity_of_a_point_off_the_centre_of_a_turning_object():
     track, truth = drive(80, turn_rad=0.05)
     center, forward = track.filter.center_m, truth[-1][:3, :3] @ [0.0, 0.0, 1.0]
-    side = track.velocity_at(center + [1.0, 0, 0]) - track.velocity_at(center)
+    side = track.velocity_at(center + np.array([1.0, 0, 0])) - track.velocity_at(center)
     np.testing.assert_allclose(side, np.cross([0.0, 0.5, 0.0], [1.0, 0, 0]), atol=0.02)
     speed = track.velocity_at(np.full(3, np.nan))
     assert np.linalg.norm(speed) == pytest.approx(10.0, abs=0.2)

@@ -41,9 +41,7 @@ def without(found, *labels):
     """What the detector answers where it misses some objects."""
     keep = ~np.isin(found.label_ids, labels)
     pixels = np.where(np.isin(found.labels, labels), 0, found.labels)
-    return Detections(
-        pixels, found.label_ids[keep], found.class_names[keep], found.scores[keep]
-    )
+    return Detections(pixels, found.label_ids[keep], found.class_names[keep], found.scores[keep])
 
 
 @pytest.fixture(scope="module")
