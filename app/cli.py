@@ -208,6 +208,12 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         metavar="WHAT",
         help="simulated sequences: noisy, worn inputs; all of them, or for example flow,masks",
     )
+    parser.add_argument(
+        "--provide",
+        metavar="WHAT",
+        help="simulated sequences: which inputs come, of depth,flow,masks,right; 'right' alone is "
+        "a stereo camera and nothing else (default: depth,flow,masks)",
+    )
     _add_settings(parser)
     _add_output(parser)
 

@@ -9,7 +9,7 @@ import shlex
 from argparse import Namespace
 from typing import Any
 
-from app import console
+from app import bootstrap, console
 from app.runs import INTERRUPTED
 
 
@@ -20,6 +20,8 @@ def prepare(arguments: Namespace) -> int:
     from pipelines.prepare import prepare as prepare_sequence
 
     config = load_config(arguments.config, arguments.overrides)
+    if config.flow.name == "pwc_net":
+        bootstrap.ensure_torch()
     counting = console.counting("preparing", arguments.quiet)
     with console.warnings(), counting as progress:
         sequence = open_sequence(arguments.path, arguments.dataset, arguments.sequence)

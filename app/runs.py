@@ -10,7 +10,7 @@ from argparse import Namespace
 from contextlib import suppress
 from typing import Any
 
-from app import console
+from app import bootstrap, console
 from pipelines.errors import ConfigError, DyObError
 
 SIMULATED = "simulated"
@@ -27,6 +27,8 @@ def run(arguments: Namespace) -> int:
     if arguments.seed is not None:
         overrides.append(f"tracking.seed={arguments.seed}")
     config = load_config(arguments.config, overrides)
+    if config.flow.name == "pwc_net":
+        bootstrap.ensure_torch()
     options = _simulation_options(arguments)
     counting = console.counting("rendering the scene", arguments.quiet)
     with console.warnings(), counting as progress:
@@ -151,11 +153,16 @@ def _is_simulated(arguments: Namespace) -> bool:
 def _simulation_options(arguments: Namespace) -> dict[str, Any]:
     """Options that only simulated sequences take."""
     if not _is_simulated(arguments):
-        if arguments.degrade:
-            raise ConfigError(
-                f"--degrade wears the inputs of simulated sequences, and {arguments.path} is none: "
-                "leave --degrade out or run simulated:street"
-            )
+        for flag in ("degrade", "provide"):
+            if getattr(arguments, flag):
+                raise ConfigError(
+                    f"--{flag} alters the inputs of simulated sequences, and {arguments.path} is "
+                    f"none: leave --{flag} out or run simulated:street"
+                )
         return {}
-    given = {"degrade": arguments.degrade, "seed": arguments.seed}
+    given = {
+        "degrade": arguments.degrade,
+        "seed": arguments.seed,
+        "provide": arguments.provide,
+    }
     return {name: value for name, value in given.items() if value is not None}

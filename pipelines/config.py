@@ -223,11 +223,10 @@ class ObjectsConfig:
     max_points: int = 200  # tracked points of one object
     min_points: int = 12  # fewer that agree with a motion do not prove it
     min_inlier_share: float = 0.4  # nor does a smaller share of the points measured
-    max_depth_m: float = (
-        25.0  # m, ThDepthObj (VDO-SLAM, KITTI): motions beyond are not told, 0 = any
-    )
+    # m, ThDepthObj (VDO-SLAM, KITTI): motions of things beyond are not told, 0 = any
+    max_depth_m: float = 25.0
     max_speed_std_mps: float = 1.5  # m/s, a less certain speed is not reported
-    max_turn_std_deg: float = 1.0  # deg a frame, nor is a motion whose turn is less certain
+    max_turn_std_deg: float = 0.7  # deg a frame, nor is a motion whose turn is less certain
     # speed: in m/s against its own uncertainty; scene_flow: the paper's threshold in m a frame
     motion_rule: Literal["speed", "scene_flow"] = "speed"
     min_speed_mps: float = 0.3  # m/s, slower is still; the speed of turning counts as well
@@ -239,7 +238,7 @@ class ObjectsConfig:
     max_carried_s: float = 0.5  # s, a mask is carried by flow so long without a detection
     max_age_s: float = 3.0  # s, an object out of sight so long is forgotten
     acceleration_mps2: float = 3.0  # m/s^2, how fast objects change their speed (process noise)
-    turn_radps2: float = 1.0  # rad/s^2, and how fast their turning
+    turn_radps2: float = 0.5  # rad/s^2, and how fast their turning
 
     def __post_init__(self) -> None:
         _check(self, max_points=(6, 5000), min_points=(6, 1000), min_inlier_share=(0, 1))

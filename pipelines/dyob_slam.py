@@ -91,7 +91,7 @@ class DyObSlam:
             estimates = self._objects.estimate(
                 view, objects, tracked.T_world_camera, tracked.covariance
             )
-            self._forget_landmarks(view, tracked, objects)
+            view, tracked = self._forget_landmarks(view, tracked, objects)
         # 10. Sparse map
         with self._stage("mapping"):
             is_keyframe = self._grow_map(view, tracked)
@@ -203,7 +203,7 @@ class DyObSlam:
 
     @property
     def _uses_geometry(self) -> bool:
-        use = self.config.geometry.use
+        use = self.config.geometry.use if self.config.objects.enabled else "never"
         return use == "always" or (use == "auto" and self._segmentation.name != FILES)
 
     def _apply_geometry(
@@ -230,18 +230,33 @@ class DyObSlam:
         self._geometry.rename(names)
         return view.masked(self._labels_that_move(objects, view), self._dilation_px)
 
-    def _forget_landmarks(self, view: View, tracked: TrackedFrame, objects: ObjectFrame) -> None:
-        """Parked cars that drive off take their points of the map with them."""
+    def _forget_landmarks(
+        self, view: View, tracked: TrackedFrame, objects: ObjectFrame
+    ) -> tuple[View, TrackedFrame]:
+        """Parked cars that drive off take their points of the map with them.
+
+        What is left of the view and its tracks, so that nothing on them is mapped again.
+        """
         before, self._landmarks = (
             self._landmarks,
             set(self._objects.landmark_ids(view.timestamp_s)),
         )
         gone = [i for i in before - self._landmarks if i in objects.windows]
         if not gone or tracked.status is not TrackingStatus.OK:
-            return
-        ids, uv = self.map.local_points(tracked.T_world_camera, np.empty(0, np.int64))
-        column, row = np.rint(uv).astype(np.int64).T
-        self.map.remove_points(ids[np.isin(objects.labels[row, column], gone)])
+            return view, tracked
+        # Widened: the points lie where the thing stood until now
+        left_by = np.where(np.isin(objects.labels, gone), objects.labels, 0).astype(np.int32)
+        without = view.masked(left_by, self._dilation_px)
+        ids, uv = self.map.local_points(tracked.T_world_camera, tracked.tracks.point_ids)
+        ids = np.concatenate([ids, tracked.tracks.point_ids])
+        self.map.remove_points(ids[~without.is_static(np.vstack([uv, tracked.tracks.uv_px]))])
+        alive = self.map.alive[tracked.tracks.point_ids]
+        return view.masked(self._labels_that_move(objects, view), self._dilation_px), replace(
+            tracked,
+            tracks=tracked.tracks[alive],
+            inliers=tracked.inliers[alive],
+            visible_ids=tracked.visible_ids[self.map.alive[tracked.visible_ids]],
+        )
 
     def _grow_map(self, view: View, tracked: TrackedFrame) -> bool:
         """Whether the frame became a keyframe; LOST ones leave the map alone."""

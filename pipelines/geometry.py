@@ -89,9 +89,26 @@ def rotation_angle_deg(T: Array) -> Array:
 
 
 def rotation_vector(T: Array) -> Array:
-    """Rotation vectors (..., 3) in rad of motions (..., 4, 4)."""
-    flat = T[..., :3, :3].reshape(-1, 3, 3)
-    return Rotation.from_matrix(flat).as_rotvec().reshape(*T.shape[:-2], 3)
+    """Rotation vectors (..., 3) in rad of motions (..., 4, 4); angles well below a half turn."""
+    R = T[..., :3, :3]
+    w = 0.5 * np.stack(
+        [
+            R[..., 2, 1] - R[..., 1, 2],
+            R[..., 0, 2] - R[..., 2, 0],
+            R[..., 1, 0] - R[..., 0, 1],
+        ],
+        -1,
+    )
+    sine = np.linalg.norm(w, axis=-1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0))
+    return w * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)[..., None]
+
+
+def rotation_of(rotation_vector_rad: Array) -> Array:
+    """Rotations (..., 3, 3) of rotation vectors (..., 3) in rad."""
+    v = np.zeros((*rotation_vector_rad.shape[:-1], 6))
+    v[..., :3] = rotation_vector_rad
+    return exp_se3(v)[..., :3, :3]
 
 
 def q_xyzw_from_T(T: Array) -> Array:

@@ -73,6 +73,13 @@ MODELS = {
         sha256="bf2d0c1e",  # torchvision puts the first digits into its file names
         size_mb=170,
     ),
+    "pwc_net": KnownModel(
+        "pwc_net.pth.tar",
+        "PWC-Net's published weights for PyTorch, for the flow `pwc_net`",
+        "CC BY-NC-SA 4.0 (NVIDIA): not for commercial use",
+        "flow.model",
+        advice="take pwc_net.pth.tar from the folder PyTorch of NVIDIA's repository PWC-Net",
+    ),
 }
 
 

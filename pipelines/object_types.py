@@ -75,7 +75,8 @@ class ObjectEstimates:
         centre, in world axes; NaN where there is no H.
     centers_m: (M, 3) the object's centre in the world. speed_mps, speed_std_mps: (M,) of that
         centre by eq. (6) of the paper from this frame's H alone; NaN where there is none.
-    velocities_mps: (M, 3) and velocity_std_mps: (M,), along the velocity, of the Kalman filter.
+    velocities_mps: (M, 3) and velocity_std_mps: (M,), along the velocity, of the Kalman filter;
+        NaN before a motion of the object was measured.
     extents_m: (M, 3) size of the box around the object's points, along the object's axes.
     """
 

@@ -125,8 +125,11 @@ def pose_errors(Ts_est: Array, Ts_gt: Array) -> tuple[Array, Array]:
 def _pose_errors(
     estimates: ObjectEstimates, truth: ObjectTruth, row: NDArray[np.int64]
 ) -> dict[str, Any]:
-    """Over all matched tracks of objects that ever move; a track is a pair of true and own id."""
-    known = np.isfinite(estimates.Ts_world_object).all((1, 2))
+    """Over all matched tracks of objects that ever move; a track is a pair of true and own id.
+
+    Poses count where the motion to them was measured; elsewhere they are only predicted.
+    """
+    known = np.isfinite(estimates.Hs_world_curr_prev).all((1, 2))
     usable = np.flatnonzero(known & of_match(truth.moving, row))
     pairs = np.stack([truth.object_id[row[usable]], estimates.object_id[usable]], 1)
     kinds, which = np.unique(pairs, axis=0, return_inverse=True)

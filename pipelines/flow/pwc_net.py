@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pipelines.errors import ModelError
 from pipelines.flow.images import check_pair
+from pipelines.models import find_model, how_to_get
 from pipelines.types import Image
 
 if TYPE_CHECKING:
@@ -23,11 +24,8 @@ if TYPE_CHECKING:
 
     from pipelines.flow.pwc_layers import PwcNetwork
 
+_MODEL = "pwc_net"  # its name in the table of models
 _MULTIPLE_PX = 64  # the pyramid halves the image six times
-_GET_IT = (
-    "fetch the published weights with `python3 -m app models fetch pwc_net`, or give your own copy "
-    "of pwc_net.pth.tar with --set flow.model=FILE"
-)
 
 
 class PwcNetFlow:
@@ -87,7 +85,8 @@ def load_network(path: str | Path, sha256: str = "") -> PwcNetwork:
     """
     from pipelines.flow.pwc_layers import PwcNetwork
 
-    weights = _read_weights(Path(path), sha256)
+    path = find_model(_MODEL, path)
+    weights = _read_weights(path, sha256)
     network = PwcNetwork()
     _check_weights(weights, network.state_dict(), path)
     network.load_state_dict(weights)
@@ -95,9 +94,6 @@ def load_network(path: str | Path, sha256: str = "") -> PwcNetwork:
 
 
 def _read_weights(path: Path, sha256: str) -> dict[str, Any]:
-    if not path.is_file():
-        found = "no file is named" if path == Path() else f"there is no file {path}"
-        raise ModelError(f"PWC-Net's weights: {found}; {_GET_IT}")
     torch = _import_torch()
     try:
         with path.open("rb") as file:
@@ -107,7 +103,7 @@ def _read_weights(path: Path, sha256: str) -> dict[str, Any]:
     if sha256 and digest != sha256.lower():
         raise ModelError(
             f"PWC-Net's weights {path}: expected sha256 {sha256}, found {digest}, so the file is "
-            f"damaged or another one; {_GET_IT}"
+            f"damaged or another one; {how_to_get(_MODEL)}"
         )
     try:
         held = torch.load(path, map_location="cpu", weights_only=True)
@@ -115,14 +111,14 @@ def _read_weights(path: Path, sha256: str) -> dict[str, Any]:
         reason = (str(error) or type(error).__name__).strip().splitlines()[0]
         raise ModelError(
             f"PWC-Net's weights {path}: expected a state dict saved by torch, and it cannot be "
-            f"read ({reason[:120]}); {_GET_IT}"
+            f"read ({reason[:120]}); {how_to_get(_MODEL)}"
         ) from error
     if isinstance(held, dict) and isinstance(held.get("state_dict"), dict):
         held = held["state_dict"]
     if not isinstance(held, dict) or not all(isinstance(v, torch.Tensor) for v in held.values()):
         raise ModelError(
             f"PWC-Net's weights {path}: expected names with tensors, or these under 'state_dict', "
-            f"found {type(held).__name__}; {_GET_IT}"
+            f"found {type(held).__name__}; {how_to_get(_MODEL)}"
         )
     return held
 
@@ -142,7 +138,8 @@ def _check_weights(weights: dict[str, Any], wanted: dict[str, Any], path: str | 
             break
     if faults:
         raise ModelError(
-            f"PWC-Net's weights {path} do not fit this network: {'; '.join(faults)}; {_GET_IT}"
+            f"PWC-Net's weights {path} do not fit this network: {'; '.join(faults)}; "
+            f"{how_to_get(_MODEL)}"
         )
 
 

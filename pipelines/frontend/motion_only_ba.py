@@ -32,7 +32,8 @@ _NOISY = 3.0  # times the expected median of chi-square
 _MAX_NOISE_FACTOR = 2.0  # a frame may be this much noisier than the ones before
 _MIN_POINTS = 6  # fewer cannot be told from an accident
 _MAX_ITERATIONS = 10  # Levenberg-Marquardt steps per round
-_CONVERGED_SIGMAS = 0.01  # a step this small beside the pose's standard deviation ends a round
+_CONVERGED_SIGMAS = 0.01  # a step this small beside the pose's standard deviation ends the last
+_ROBUST_SIGMAS = 0.1  # and this small any other round: weights change after it anyway
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,6 +323,7 @@ class _Problem:
 
         Each body has its own damping, and stops on its own.
         """
+        converged = (_ROBUST_SIGMAS if robust else _CONVERGED_SIGMAS) ** 2
         damping = np.full(len(Ts), 1e-6)
         going = np.ones(len(Ts), bool)
         cost = self.cost(Ts, used, robust)
@@ -338,7 +340,7 @@ class _Problem:
             cost = np.where(better, cost_new, cost)
             damping = np.where(better, np.maximum(damping * 0.1, 1e-9), damping * 100.0)
             length2 = np.einsum("ji,jik,jk->j", step, H, step)
-            going &= ~(better & (length2 < _CONVERGED_SIGMAS**2)) & (damping <= 1e6)
+            going &= ~(better & (length2 < converged)) & (damping <= 1e6)
             if not going.any():
                 break
             if better.any():

@@ -36,12 +36,13 @@ class OrbExtractor:
             patchSize=_PATCH_PX,
         )
 
-    def extract(self, gray: Image, static: NDArray[np.bool_] | None = None) -> Features:
+    def extract(
+        self, gray: Image, static: NDArray[np.bool_] | None = None, movable_too: bool = False
+    ) -> Features:
         """ORB features of a grey image (H, W): the strongest of each image cell.
 
-        static: (H, W) bool. About `n_features` lie where it is True, and as many more as the rest
-        of the image has room for at the same density: a thing that turns out to stand still is a
-        landmark, too. Depths are left unknown (NaN).
+        static: (H, W) bool, about `n_features` lie where it is True. movable_too: as many more as
+        the rest has room for at the same density. Depths are left unknown (NaN).
         """
         self._orb.setNLevels(self._levels_that_fit(gray.shape))
         corners = self._orb.detect(gray, None)  # masking afterwards is faster
@@ -49,7 +50,7 @@ class OrbExtractor:
             return Features.empty()
         uv = cv2.KeyPoint_convert(corners).astype(np.float64)
         response = np.array([corner.response for corner in corners])
-        kept = self._spread(uv, response, gray.shape[:2], static)
+        kept = self._spread(uv, response, gray.shape[:2], static, movable_too)
         keypoints, descriptors = self._orb.compute(gray, [corners[i] for i in kept])
         if descriptors is None or not keypoints:
             return Features.empty()
@@ -69,21 +70,23 @@ class OrbExtractor:
         response: Array,
         shape: tuple[int, int],
         static: NDArray[np.bool_] | None,
+        movable_too: bool,
     ) -> NDArray[np.int64]:
-        """Indices of the corners to keep, of the static part and of the rest."""
+        """Indices of the corners to keep, of the static part and perhaps of the rest."""
         n_wanted = self.config.n_features
         if static is None:
             return spread_evenly(uv_px, response, shape, n_wanted)
         column, row = np.rint(uv_px).astype(np.int64).T
         is_static = static[row, column]
-        share = float(static.mean())
-        parts = []
-        for part, n in ((is_static, n_wanted), (~is_static, _share_of_rest(n_wanted, share))):
+        parts = [(is_static, n_wanted)]
+        if movable_too:
+            parts.append((~is_static, _share_of_rest(n_wanted, float(static.mean()))))
+        kept = []
+        for part, n in parts:
             candidates = np.flatnonzero(part)
-            parts.append(
-                candidates[spread_evenly(uv_px[candidates], response[candidates], shape, n)]
-            )
-        return np.sort(np.concatenate(parts))
+            best = spread_evenly(uv_px[candidates], response[candidates], shape, n)
+            kept.append(candidates[best])
+        return np.sort(np.concatenate(kept))
 
     def _levels_that_fit(self, shape: tuple[int, ...]) -> int:
         """Levels on which something of an image (H, W) is left between the borders, one at least.

@@ -18,6 +18,7 @@ from pipelines.frontend.sampling import sample_disparity
 from pipelines.object_types import Detections
 from pipelines.types import Array, Features, Frame, Image, StereoCamera
 
+_MOSTLY_STATIC = 0.6  # share of an image off movable objects, which is landmarks enough
 _CONTRAST_WINDOW_PX = 31  # neighbourhood that the corner detector's contrast is measured against
 _CONTRAST_GAIN = np.float32(40.0)  # grey levels of standard deviation afterwards
 _CONTRAST_FLOOR = 10.0  # grey levels of standard deviation below which contrast is noise
@@ -136,7 +137,9 @@ def prepare_frame(
         disparity = disparity.astype(np.float32, copy=False)
     labels = None if detections is None else detections.labels
     static = static_pixels(labels, gray.shape, orb.config.mask_dilation_px)
-    features = orb.extract(normalise_contrast(gray), static)
+    # Where little else is in view, what stands still may have to serve as a landmark
+    movable_too = float(static.mean()) < _MOSTLY_STATIC
+    features = orb.extract(normalise_contrast(gray), static, movable_too)
     return PreparedFrame(frame, gray, disparity, features, detections)
 
 

@@ -28,14 +28,13 @@ class Instances:
     """M instances of one image.
 
     labels: (H, W) int32, 0 = background, n = row n - 1. windows: where each lies, None where it has
-    no pixel. n_pixels: (M,). boxes_px: (M, 4) first and last columns and rows, NaN without pixels.
+    no pixel. boxes_px: (M, 4) first and last columns and rows, NaN without pixels.
     centers_m: (M, 3) in the camera, at the median depth; NaN where no depth is known.
     colors: (M, 64) histograms that sum to 1. class_names: (M,). scores: (M,).
     """
 
     labels: NDArray[np.int32]
     windows: list[Window | None]
-    n_pixels: NDArray[np.int64]
     boxes_px: Array
     centers_m: Array
     colors: Array
@@ -57,21 +56,17 @@ def describe_instances(
     highest = int(detections.label_ids.max(initial=0))
     table = np.zeros(highest + 1, np.int32)
     table[detections.label_ids] = np.arange(1, M + 1)
-    labels = table[np.clip(detections.labels, 0, highest)] if M else detections.labels
+    labels = table[detections.labels] if M else detections.labels
     windows = find_objects(labels, max_label=M) if M else []
-    n_pixels = np.zeros(M, np.int64)
     boxes = np.full((M, 4), np.nan)
     centers = np.full((M, 3), np.nan)
     colors = np.zeros((M, _BINS**3))
     for m, window in enumerate(windows):
         if window is None:
             continue
-        v, u = np.nonzero(labels[window] == m + 1)
-        n_pixels[m] = len(v)
         rows, columns = window
         boxes[m] = columns.start, rows.start, columns.stop - 1, rows.stop - 1
-        step = max(1, len(v) // _SAMPLES)
-        v, u = v[::step] + rows.start, u[::step] + columns.start
+        v, u = _some_pixels(labels, m + 1, window)
         colors[m] = _color_histogram(image[v, u])
         disparity = disparity_px[v, u]
         known = disparity > 0
@@ -80,8 +75,21 @@ def describe_instances(
             uv = np.array([[np.median(u), np.median(v)]])
             centers[m] = backproject(camera, uv, np.array([camera.bf / middle]))[0]
     return Instances(
-        labels, windows, n_pixels, boxes, centers, colors, detections.class_names, detections.scores
+        labels, windows, boxes, centers, colors, detections.class_names, detections.scores
     )
+
+
+def _some_pixels(
+    labels: NDArray[np.int32], label: int, window: Window
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns (N,) of about `_SAMPLES` pixels of a label, evenly spread; one at least."""
+    rows, columns = window
+    height, width = rows.stop - rows.start, columns.stop - columns.start
+    for step in (max(1, int(np.sqrt(height * width / _SAMPLES))), 1):
+        v, u = np.nonzero(labels[window][::step, ::step] == label)
+        if len(v):
+            break
+    return v * step + rows.start, u * step + columns.start
 
 
 def _color_histogram(pixels: NDArray[np.uint8]) -> Array:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from pipelines.geometry import rotation_of
 from pipelines.types import Array
 
 _MAX_TURN_RADPS = 1.0  # faster turns are noise of small objects, and would curl their prediction
@@ -60,14 +60,21 @@ class ObjectFilter:
 
     def predict(self, dt_s: float) -> None:
         """Move on by a time; the velocity turns at the rate last seen."""
-        R = Rotation.from_rotvec(self.turn_radps * dt_s).as_matrix()
-        half = Rotation.from_rotvec(self.turn_radps * (0.5 * dt_s)).as_matrix()
+        R = rotation_of(self.turn_radps * dt_s)
+        half = rotation_of(self.turn_radps * (0.5 * dt_s))
         F = np.eye(6)
         F[:3, 3:] = dt_s * half  # the chord of the arc lies half-way between both directions
         F[3:, 3:] = R
         # White acceleration, constant over the step
         G = np.vstack([0.5 * dt_s**2 * np.eye(3), dt_s * np.eye(3)])
         self._kf.predict(F=F, Q=self._acceleration**2 * G @ G.T)
+
+    def move_to(self, center_m: Array, covariance_m2: Array) -> None:
+        """Put the centre (3,) elsewhere, with a covariance (3, 3); the velocity stays."""
+        self._kf.x[:3] = center_m
+        self._kf.P[:3] = 0.0
+        self._kf.P[:, :3] = 0.0
+        self._kf.P[:3, :3] = covariance_m2
 
     def update_motion(
         self,
@@ -89,7 +96,7 @@ class ObjectFilter:
         turn = _TURN_MEMORY * self.turn_radps + (1.0 - _TURN_MEMORY) * turn_radps
         self.turn_radps = turn * min(1.0, _MAX_TURN_RADPS / max(float(np.linalg.norm(turn)), 1e-9))
         H = np.eye(6)
-        H[3:, 3:] = Rotation.from_rotvec(self.turn_radps * (-0.5 * dt_s)).as_matrix()
+        H[3:, 3:] = rotation_of(self.turn_radps * (-0.5 * dt_s))
         z = np.r_[center_m, velocity_mps]
         residual, P = z - H @ self._kf.x, H @ self._kf.P @ H.T
         R = np.zeros((6, 6))

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.frontend.hypotheses import estimate_pnp, reprojection_inliers, scale_motion
+from pipelines.frontend.hypotheses import estimate_pnp, reprojection_inliers
 from pipelines.frontend.motion_only_ba import estimate_poses
 from pipelines.geometry import (
-    exp_se3,
     invert_T,
     make_T,
     reprojection_errors,
+    rotation_of,
     rotation_vector,
     skew,
 )
@@ -83,7 +83,12 @@ def estimate_motions(
         if reprojection_inliers(camera, T, positions, uv, _INLIER_PX).mean() > share[j]:
             guesses[j] = invert_T(T)
     found = estimate_poses(
-        camera, invert_T(guesses), observations, sizes, gate_px=_GATE * _INLIER_PX
+        camera,
+        invert_T(guesses),
+        observations,
+        sizes,
+        robust_rounds=1,
+        gate_px=_GATE * _INLIER_PX,
     )
     return Motions(
         ids,
@@ -178,7 +183,9 @@ def displacement(H_world_curr_prev: Array, center_m: Array) -> Array:
 
 def scale_about(H_world_curr_prev: Array, center_m: Array, share: float) -> Array:
     """A share of a motion (4, 4): of its turn about the object's centre (3,), and of its way."""
-    R = scale_motion(make_T(H_world_curr_prev[:3, :3], np.zeros(3)), share)[:3, :3]
+    if abs(share - 1.0) < 1e-9:
+        return H_world_curr_prev
+    R = rotation_of(share * rotation_vector(H_world_curr_prev))
     way = share * displacement(H_world_curr_prev, center_m)
     return make_T(R, center_m + way - R @ center_m)
 
@@ -210,7 +217,7 @@ def fuse_motions(
     Deviation: the paper keeps the measured motion. This changes it only where it is less certain
     than the expectation, as with few or far points.
     """
-    turn = rotation_vector(make_T(H_measured[:3, :3] @ H_expected[:3, :3].T, np.zeros(3)))
+    turn = rotation_vector(H_measured[:3, :3] @ H_expected[:3, :3].T)
     way_m = displacement(H_expected, center_m)
     innovation = np.r_[turn, displacement(H_measured, center_m) - way_m]
     S = expected_covariance + measured_covariance
@@ -219,7 +226,7 @@ def fuse_motions(
         return FusedMotion(H_measured, measured_covariance, distance2)
     gain = np.linalg.solve(S, expected_covariance).T
     step = gain @ innovation
-    R = exp_se3(np.r_[step[:3], np.zeros(3)])[:3, :3] @ H_expected[:3, :3]
+    R = rotation_of(step[:3]) @ H_expected[:3, :3]
     covariance = (np.eye(6) - gain) @ expected_covariance
     return FusedMotion(
         make_T(R, center_m + way_m + step[3:] - R @ center_m),
@@ -234,6 +241,10 @@ def points_std(covariance: Array, spread_m: float) -> float:
     spread_m: root mean square distance of the points from the object's centre. Along the worst
     direction, of the centre and of what a wrong turn adds.
     """
-    turn = np.linalg.eigvalsh(covariance[:3, :3])[-1]
-    way = np.linalg.eigvalsh(covariance[3:, 3:])[-1]
-    return float(np.sqrt(max(way + turn * spread_m**2, 0.0)))
+    way, turn = largest_std(covariance[3:, 3:]), largest_std(covariance[:3, :3])
+    return float(np.hypot(way, turn * spread_m))
+
+
+def largest_std(covariance: Array) -> float:
+    """Standard deviation along the worst direction of a covariance (3, 3)."""
+    return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0)))

@@ -22,6 +22,7 @@ from pipelines.types import Array, Image, StereoCamera
 Window = tuple[slice, slice]  # rows and columns of an image
 _CORNER_WINDOW_PX = 5  # of the structure tensor that ranks pixels
 _MIN_CELL_PX, _MAX_CELL_PX = 2, 12
+_AREA_PER_POINT_PX, _FEWEST_POINTS = 36, 24
 _SIGMA_NEW_UV_PX = 0.05  # px, small: a point is by definition where it was first seen
 # Masks are worn at their edges: a rim is left out, thinner on smaller objects
 _RIM_PX = ((4000, 3), (1000, 2), (250, 1))  # least pixels of an object, rim
@@ -82,6 +83,11 @@ def create_points(
     sigma = np.full(len(uv), sigma_disparity_px)
     points, covariances = make_points(camera, np.eye(4), uv, disparity, _SIGMA_NEW_UV_PX, sigma)
     return ObjectPoints(owner, points, covariances, uv)
+
+
+def points_wanted(area_px: int, max_points: int) -> int:
+    """How many points an object of an area should have: closer ones would see the same patch."""
+    return min(max_points, max(_FEWEST_POINTS, area_px // _AREA_PER_POINT_PX))
 
 
 def choose_pixels(

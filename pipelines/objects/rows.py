@@ -54,7 +54,7 @@ class RowTable:
                 "speed": speed_mps,
                 "speed_std": speed_std_mps,
                 "velocity": track.velocity_at(center_m),
-                "velocity_std": np.nan if track.filter is None else track.filter.speed_std_mps,
+                "velocity_std": track.velocity_std_mps,
                 "extent": track.extent_m,
             }
         )

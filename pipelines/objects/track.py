@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from pipelines.config import ObjectsConfig
 from pipelines.geometry import (
     invert_T,
     make_T,
     orthonormalise,
+    rotation_of,
     rotation_vector,
     skew,
     transform_points,
@@ -26,7 +26,7 @@ from pipelines.objects.motion import scale_about
 from pipelines.types import Array
 
 _COLOR_MEMORY = 0.8  # share of the old colours that each frame keeps
-_EXTENT_PERCENTILES = (4.0, 96.0)  # of the points, so that a stray one does not blow up the box
+_STRAY_SHARE = 0.04  # of the points at each end, left out so that strays do not blow up the box
 _GROWTH = 0.3  # of the way to them by which the box grows in a frame, for the same reason
 _SEEN_SIGMA_M = 1.0  # the middle of a mask, at its median depth
 _PART_SHARE = 0.35  # of its size, the same where a part of it may be hidden
@@ -89,14 +89,34 @@ class ObjectTrack:
         """(4,) its last box, NaN where it was missed for so long that it will be elsewhere."""
         return self.box_px if self.missed_s <= self.config.max_carried_s else np.full(4, np.nan)
 
+    @property
+    def _is_anchored(self) -> bool:
+        """Whether its pose is tied to its matter: its motion was measured a moment ago."""
+        return self.has_motion and self.unmeasured_s <= _MAX_SLIP_S
+
+    @property
+    def has_motion(self) -> bool:
+        """Whether a motion of it was ever measured, be it none at all."""
+        return self.H_dt_s > 0.0
+
     def velocity_at(self, point_m: Array) -> Array:
-        """(3,) m/s of the object's matter at a point (3,) in the world, by the filter."""
-        if self.filter is None:
+        """(3,) m/s of the object's matter at a point (3,) in the world, by the filter.
+
+        NaN before a motion was measured: middles of masks alone say little of a speed.
+        """
+        if self.filter is None or not self.has_motion:
             return np.full(3, np.nan)
         velocity = self.filter.velocity_mps
         if np.isfinite(point_m).all():
             velocity = velocity + np.cross(self.filter.turn_radps, point_m - self.filter.center_m)
         return velocity
+
+    @property
+    def velocity_std_mps(self) -> float:
+        """Standard deviation along the filter's velocity, NaN where that is not told."""
+        if self.filter is None or not self.has_motion:
+            return np.nan
+        return self.filter.speed_std_mps
 
     def is_landmark(self, timestamp_s: float) -> bool:
         """Whether it has been still for so long that it serves the camera as the world does."""
@@ -111,11 +131,11 @@ class ObjectTrack:
         if self.filter is None:
             return np.eye(4)
         turn = self.filter.turn_radps * dt_s
-        way_m = Rotation.from_rotvec(-0.5 * turn).apply(self.filter.velocity_mps) * dt_s
+        way_m = rotation_of(-0.5 * turn) @ self.filter.velocity_mps * dt_s
         center = self.filter.center_m - way_m
         if self.H_world_curr_prev is not None:
             return scale_about(self.H_world_curr_prev, center, dt_s / self.H_dt_s)
-        R = Rotation.from_rotvec(turn).as_matrix()
+        R = rotation_of(turn)
         return make_T(R, center + way_m - R @ center)
 
     def expected_motion(self, center_m: Array, dt_s: float) -> tuple[Array, Array]:
@@ -144,8 +164,12 @@ class ObjectTrack:
 
     def take_motion(self, H: Array, covariance: Array, center_m: Array, dt_s: float) -> None:
         """Take a measured motion (4, 4) into filter and pose. covariance: about the centre (3,)."""
-        if self.T_world_object is None:
-            self.T_world_object = invert_T(H) @ make_T(np.eye(3), center_m)
+        if not self._is_anchored:
+            # So far the middle of a mask was all that was known, be it of what stood before it
+            R = np.eye(3) if self.T_world_object is None else self.T_world_object[:3, :3]
+            self.T_world_object = invert_T(H) @ make_T(H[:3, :3] @ R, center_m)
+            self.low_m, self.high_m = np.full(3, np.nan), np.full(3, np.nan)
+        assert self.T_world_object is not None
         before = self.T_world_object[:3, 3]
         self.T_world_object = orthonormalise(H @ self.T_world_object)
         origin = self.T_world_object[:3, 3].copy()
@@ -155,6 +179,8 @@ class ObjectTrack:
         loose = covariance_m2 + _CENTER_SIGMA_M**2 * np.eye(3)
         if self.filter is None:
             self.filter = ObjectFilter(origin, loose, self.config.acceleration_mps2)
+        elif not self._is_anchored:
+            self.filter.move_to(origin, loose)
         self.filter.update_motion(
             origin, loose, (origin - before) / dt_s, covariance_m2 / dt_s**2,
             turn_radps=rotation_vector(H) / dt_s, dt_s=dt_s,
@@ -168,7 +194,12 @@ class ObjectTrack:
         return max(_SEEN_SIGMA_M, _PART_SHARE * float(np.nan_to_num(self.extent_m).max()))
 
     def take_center(self, center_m: Array) -> None:
-        """Take in where the middle (3,) of what is seen of it lies, where there is no motion."""
+        """Take in where the middle (3,) of what is seen of it lies, where there is no motion.
+
+        Of an object whose motion was measured a moment ago the prediction knows better.
+        """
+        if self._is_anchored:
+            return
         covariance = self.center_sigma_m**2 * np.eye(3)
         if self.filter is None or self.T_world_object is None:
             self.filter = ObjectFilter(center_m, covariance, self.config.acceleration_mps2)
@@ -207,7 +238,9 @@ class ObjectTrack:
         """Widen the box by the points (N, 3) seen now."""
         assert self.T_world_object is not None
         local = transform_points(invert_T(self.T_world_object), points_world_m)
-        low, high = np.percentile(local, _EXTENT_PERCENTILES, axis=0)
+        ordered = np.sort(local, axis=0)
+        left_out = int(_STRAY_SHARE * len(ordered))
+        low, high = ordered[left_out], ordered[-1 - left_out]
         if np.isnan(self.low_m).any():
             self.low_m, self.high_m = low, high
         self.low_m = self.low_m + _GROWTH * np.minimum(low - self.low_m, 0.0)

@@ -24,13 +24,14 @@ from pipelines.objects.motion import (
     GATE_6DOF,
     displacement,
     fuse_motions,
+    largest_std,
     motion_in_world,
     move_points,
     points_std,
     world_covariance,
 )
 from pipelines.objects.motion_state import decide_by_scene_flow, decide_by_speed
-from pipelines.objects.points import ObjectPoints, choose_pixels
+from pipelines.objects.points import ObjectPoints, choose_pixels, points_wanted
 from pipelines.objects.rows import RowTable
 from pipelines.objects.solver import MotionSolver, Solution
 from pipelines.objects.track import ObjectTrack
@@ -40,6 +41,7 @@ from pipelines.types import Array
 _SURE_SHARE = 0.6  # of the points that must agree with a motion that nobody expected
 _LASTING_SHARE = 0.5  # of a speed's error stays from frame to frame, as its points do
 _MOSTLY_SEEN = 0.6  # of its last mask, below which a mask does not say where an object is
+_ENOUGH = 0.8  # of the points wanted on an object, above which no new ones are taken
 _SURE_SPEED_MPS = 1.0  # m/s, standard deviation of a speed by which points may be expected
 
 
@@ -62,8 +64,13 @@ class ObjectTracker:
 
         detections: None where there is no answer for this frame. T_predicted: (4, 4) expected pose
         of the camera. Objects that are missed keep their masks, carried by flow, for a while;
-        detections that are no known object begin one.
+        detections that are no known object begin one. Where objects are not wanted, what was
+        detected is what it is, and nothing of it is remembered.
         """
+        if not self.config.enabled:
+            seen = Detections.empty(view.gray.shape) if detections is None else detections
+            nothing = ObjectPoints.empty(), Followed.empty()
+            return ObjectFrame(seen.labels, detections is not None, *nothing, False)
         dt_s = self._time_since_last(view)
         for track in self.tracks.values():
             if track.filter is not None:
@@ -129,7 +136,9 @@ class ObjectTracker:
         has_points = set(frame.points.object_id.tolist())
         for known_id, m in found.items():
             table[m + 1] = known_id
-        for m in np.flatnonzero(instances.n_pixels > 0).tolist():
+        for m, window in enumerate(instances.windows):
+            if window is None:
+                continue
             if table[m + 1] == 0:
                 table[m + 1] = self._next_id
                 self.tracks[self._next_id] = ObjectTrack(self._next_id, self.config)
@@ -137,8 +146,7 @@ class ObjectTracker:
             object_id = int(table[m + 1])
             if object_id not in has_points and object_id not in frame.new_ids:
                 frame.new_ids.append(object_id)
-            window, score = instances.windows[m], float(instances.scores[m])
-            assert window is not None
+            score = float(instances.scores[m])
             if scores is not None and object_id in scores:
                 nameless = str(instances.class_names[m]) == UNNAMED_CLASS
                 score = score if nameless else scores[object_id]
@@ -231,8 +239,10 @@ class ObjectTracker:
 
         frame: what `associate` answered, perhaps revised. T_world_camera: (4, 4) with covariance
         (6, 6) as in `FrameResult`; NaN where it was only predicted: no motion is told then, nor in
-        the frame after.
+        the frame after. No rows where objects are not wanted.
         """
+        if not self.config.enabled:
+            return ObjectEstimates.empty()
         table = RowTable(view.frame_index, view.timestamp_s)
         for object_id in frame.windows:
             self.tracks[object_id].box_px = frame.box_px(object_id)
@@ -373,8 +383,7 @@ class ObjectTracker:
 
     def _is_certain(self, covariance: Array, spread_m: float, dt_s: float) -> bool:
         """Whether a motion with a covariance (6, 6) is worth telling; no wild estimates go out."""
-        turn_std = float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0)))
-        if turn_std > np.radians(self.config.max_turn_std_deg):
+        if largest_std(covariance[:3, :3]) > np.radians(self.config.max_turn_std_deg):
             return False
         return points_std(covariance, spread_m) <= self.config.max_speed_std_mps * dt_s
 
@@ -383,7 +392,7 @@ class ObjectTracker:
     ) -> ObjectState:
         """State by the speed of the object's points: of its centre, and of its sure turning."""
         assert track.filter is not None
-        turn_std = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])) / dt_s
+        turn_std = largest_std(covariance[:3, :3]) / dt_s
         turn = float(np.linalg.norm(track.filter.turn_radps))
         sure_turn = max(0.0, turn - self.config.significance * turn_std)
         speed = float(np.linalg.norm(track.filter.velocity_mps)) + sure_turn * spread_m
@@ -469,9 +478,10 @@ class ObjectTracker:
                 track.take_points(transform_points(T_world_camera, moved.position_m[own]))
             mask = frame.mask(object_id)
             track.area_px = int(np.count_nonzero(mask))
-            chosen = choose_pixels(
-                view.gray, mask, window, self.config.max_points, moved.uv_px[own]
-            )
+            wanted = points_wanted(track.area_px, self.config.max_points)
+            if own.sum() >= _ENOUGH * wanted:
+                continue
+            chosen = choose_pixels(view.gray, mask, window, wanted, moved.uv_px[own])
             pixels.append(chosen)
             owner.append(np.full(len(chosen), object_id, np.int64))
         new = self._solver.create_points(

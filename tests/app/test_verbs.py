@@ -73,7 +73,9 @@ def test_render_draws_pictures_of_the_size_asked_for(result: Path) -> None:
     assert done.returncode == 0, done.stderr
     files = [Path(line) for line in done.stdout.splitlines() if line.endswith(".png")]
     diagrams = [file for file in files if file.parent.name == "plots"]
-    assert len(diagrams) == 3
+    # No speeds: four steps are too few to draw
+    names = {"trajectory.png", "rpe.png", "timings.png", "objects_timeline.png"}
+    assert {file.name for file in diagrams} == names
     maps = [file for file in files if file.parent.name == "renders"]
     assert len(maps) == 2
     for file in maps:

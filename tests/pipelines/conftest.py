@@ -70,6 +70,50 @@ def stereo_street(render_cache) -> Sequence:
     return open_sequence("simulated:static", **options)
 
 
+@pytest.fixture(scope="session")
+def board_frames(street) -> Callable[..., list[Frame]]:
+    """A standing camera before the street, with a painted board that slides; see `paste_board`."""
+
+    def make(n_frames: int, **board) -> list[Frame]:
+        return paste_board(street.read(0), n_frames, **board)
+
+    return make
+
+
+def paste_board(
+    still: Frame,
+    n_frames: int,
+    *,
+    size: tuple[int, int] = (60, 90),
+    at: tuple[int, int] = (60, 150),
+    depth_m: float = 8.0,
+    step_px: Callable[[int], int] = lambda k: 0,
+) -> list[Frame]:
+    """Frames, 0.1 s apart, of one picture with a board of (height, width) before it.
+
+    at: row and column of its corner in the first frame. step_px: columns that it moves by until
+    frame k. Depth, flow and mask (label 5, a car; all else is background) are exact.
+    """
+    rng, frames = np.random.default_rng(1), []
+    noise = rng.normal(size=(*size, 3)).astype(np.float32)
+    paint = cv2.GaussianBlur(noise, (0, 0), 1.2) + 2 * cv2.GaussianBlur(noise, (0, 0), 4)
+    paint = np.clip(120 + 40 * paint / paint.std(), 0, 255).astype(np.uint8)
+    rows, column = slice(at[0], at[0] + size[0]), at[1]
+    for k in range(n_frames):
+        step = step_px(k) if k > 0 else 0
+        flow = np.zeros((*still.image.shape[:2], 2), np.float32)
+        flow[rows, column : column + size[1], 0] = step
+        column += step
+        columns = slice(column, column + size[1])
+        image, depth = still.image.copy(), still.depth_m.copy()
+        labels = np.zeros(depth.shape, np.int32)
+        image[rows, columns], depth[rows, columns], labels[rows, columns] = paint, depth_m, 5
+        frames.append(
+            Frame(k, 0.1 * k, image, None, depth, flow if k > 0 else None, labels, {5: "car"})
+        )
+    return frames
+
+
 @pytest.fixture
 def vdo_folder(street: Sequence, tmp_path: Path) -> Path:
     """The street's first ten frames in VDO-SLAM's layout, free to be damaged."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from pipelines.datasets import open_sequence
 from pipelines.geometry import invert_T, rotation_angle_deg
@@ -105,16 +106,29 @@ def _redwood_T(source: Path, index: int) -> np.ndarray:
     return np.array([[float(x) for x in line.split()] for line in lines[5 * index + 1 :][:4]])
 
 
-def test_truth_of_real_data_changes_no_byte(real_data, tmp_path) -> None:
-    name = "kitti_odom06_000-050_stereo"
+@pytest.mark.parametrize(
+    ("name", "truth", "n_objects"),
+    [
+        ("kitti_odom06_000-050_stereo", {"poses.txt"}, 0),
+        ("kitti_tracking_0003_vdo_format_10f", {"pose_gt.txt", "object_pose.txt"}, 5),
+    ],
+)
+def test_truth_of_real_data_changes_no_byte(
+    name: str, truth: set[str], n_objects: int, real_data, tmp_path
+) -> None:
     blind = tmp_path / name
     blind.mkdir()
+    assert truth <= {entry.name for entry in real_data(name).iterdir()}
     for entry in real_data(name).iterdir():
-        if entry.name != "poses.txt":
+        if entry.name not in truth:
             (blind / entry.name).symlink_to(entry, target_is_directory=entry.is_dir())
     with_truth = run(open_sequence(real_data(name)), output=tmp_path / "with", frames=5)
     without = run(open_sequence(blind), output=tmp_path / "without", frames=5)
     assert "camera" in with_truth.metrics
     assert "camera" not in without.metrics
-    for file in ("camera_tum.txt", "camera_kitti.txt", "static_map.ply"):
+    trajectories = [f"objects/{p.name}" for p in (with_truth.folder / "objects").glob("*")]
+    assert len(without.objects) >= n_objects
+    assert len(trajectories) == len(list((without.folder / "objects").glob("*")))
+    files = ("camera_tum.txt", "camera_kitti.txt", "static_map.ply", "objects.csv")
+    for file in (*files, *trajectories):
         assert (with_truth.folder / file).read_bytes() == (without.folder / file).read_bytes()

@@ -31,6 +31,7 @@ FILES = {
     "camera_gt_tum.txt",
     "objects_gt.csv",
 }
+TRAJECTORIES = {"objects"}  # a folder, where there was an object
 TRUTH = {
     "vdo": ("pose_gt.txt", "object_pose.txt"),
     "tum_rgbd": ("groundtruth.txt",),
@@ -62,7 +63,13 @@ class Witness:
 
 
 def estimates(folder: Path) -> dict[str, bytes]:
-    return {name: (folder / name).read_bytes() for name in ESTIMATES}
+    """Content of every file of the estimate, of each object's trajectory too, by name."""
+    trajectories = sorted(f"objects/{path.name}" for path in (folder / "objects").glob("*"))
+    return {name: (folder / name).read_bytes() for name in (*ESTIMATES, *trajectories)}
+
+
+def names_in(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
 
 
 def poses_of(path: Path) -> Any:
@@ -83,7 +90,13 @@ def whole(street, tmp_path_factory) -> tuple[Result, Witness]:
 
 
 def test_the_folder_holds_the_files_of_the_design_and_no_others(whole) -> None:
-    assert {path.name for path in whole[0].folder.iterdir()} == FILES
+    folder = whole[0].folder
+    assert names_in(folder) == FILES | TRAJECTORIES
+    ids = np.unique(whole[0].objects.object_id)
+    assert len(ids) > 5
+    written = {path.name for path in (folder / "objects").iterdir()}
+    assert {name[:4] for name in written} == {f"{i:03d}_" for i in ids}
+    assert {name[4:] for name in written} == {"car_tum.txt", "person_tum.txt"}
 
 
 def test_evo_reads_both_trajectories_and_they_agree(whole, street) -> None:
@@ -198,13 +211,20 @@ def test_fewer_frames_than_asked_for_are_no_error(street, tmp_path) -> None:
     assert result.metrics["run"]["frames"] == 2
 
 
-def test_flow_between_frames_that_are_not_neighbours_is_dropped(street, tmp_path) -> None:
-    neighbours, others = Witness(), Witness()
-    run(street, output=tmp_path / "a", start=2, frames=3, sinks=[neighbours])
-    run(street, output=tmp_path / "b", start=2, frames=3, stride=2, sinks=[others])
-    given = [frame.flow_prev_to_curr_px is not None for frame, _ in neighbours.frames]
-    assert given == [False, True, True]  # the first points from a frame that was not seen
-    assert [frame.flow_prev_to_curr_px for frame, _ in others.frames] == [None] * 3
+def test_flow_between_frames_that_are_not_neighbours_is_not_used(street, tmp_path, altered) -> None:
+    """The bytes are those of a run whose sequence brings flow for no frame at all."""
+
+    def no_flow(frame: Frame) -> Frame:
+        return dataclasses.replace(frame, flow_prev_to_curr_px=None)
+
+    span = {"start": 2, "frames": 4, "stride": 2}
+    given = run(street, output=tmp_path / "given", **span)
+    none = run(altered(street, no_flow), output=tmp_path / "none", **span)
+    assert estimates(given.folder) == estimates(none.folder)
+    neighbours = {"start": 2, "frames": 4}
+    given = run(street, output=tmp_path / "a", **neighbours)
+    none = run(altered(street, no_flow), output=tmp_path / "b", **neighbours)
+    assert estimates(given.folder) != estimates(none.folder)  # else nothing was compared
 
 
 def test_dropped_frames_are_tracked_across(street, tmp_path) -> None:
@@ -280,7 +300,7 @@ def test_ctrl_c_leaves_the_frames_done_so_far(street, tmp_path, whole, at: int) 
     witness = Witness(at, KeyboardInterrupt())
     result = run(street, output=tmp_path / "partial", sinks=[witness])
     assert witness.told == ["start"] + ["frame"] * (at + 1) + ["finish"]
-    assert {path.name for path in result.folder.iterdir()} == FILES
+    assert names_in(result.folder) == FILES | TRAJECTORIES
     counts = result.metrics["run"]
     assert counts["interrupted"] is True
     assert counts["frames"] == counts["tracked"] == at + 1
@@ -339,12 +359,15 @@ def test_deleted_truth_changes_no_byte_of_the_estimate(dataset, request, tmp_pat
     assert open_sequence(blind).ground_truth() is None
     assert "camera" in with_truth.metrics
     assert "camera" not in without.metrics
-    assert {p.name for p in without.folder.iterdir()} == FILES - {
-        "camera_gt_tum.txt",
-        "objects_gt.csv",
-    }
+    expected = FILES - {"camera_gt_tum.txt", "objects_gt.csv"}
+    if dataset != "kitti_odometry":  # a street without traffic
+        expected |= TRAJECTORIES
+    assert names_in(without.folder) == expected
     assert without.metrics["run"]["tracked"] > 5
     assert estimates(with_truth.folder) == estimates(without.folder)
+    if dataset == "vdo":  # its masks make objects at once: bytes of something were compared
+        assert len(without.objects) > 50
+        assert (without.objects.state == "moving").sum() > 5
 
 
 def test_false_truth_changes_no_byte_of_the_estimate(vdo_folder, tmp_path) -> None:
@@ -352,6 +375,9 @@ def test_false_truth_changes_no_byte_of_the_estimate(vdo_folder, tmp_path) -> No
     rows = np.loadtxt(vdo_folder / "pose_gt.txt")
     rows[:, [4, 8, 12]] *= 3.0  # three times as far
     np.savetxt(vdo_folder / "pose_gt.txt", rows, fmt="%.9f")
+    objects = np.loadtxt(vdo_folder / "object_pose.txt")
+    objects[:, 2:5] += objects[:, :1]  # every object moves by a metre a frame more
+    np.savetxt(vdo_folder / "object_pose.txt", objects, fmt="%.6f")
     false = run(open_sequence(vdo_folder), output=tmp_path / "false", frames=5)
     assert estimates(right.folder) == estimates(false.folder)
     assert false.metrics["camera"]["rpe_trans_rmse_m"] > 1.0  # it was read, and told apart

@@ -185,7 +185,7 @@ def test_damaged_files_are_one_sentence(tmp_path, content) -> None:
     with pytest.raises(ModelError, match="cannot be read") as raised:
         load_network(path)
     assert "\n" not in str(raised.value)
-    assert "models fetch pwc_net" in str(raised.value)
+    assert "models add pwc_net FILE" in str(raised.value)
 
 
 def test_a_download_that_broke_off(pwc_weights, tmp_path) -> None:
@@ -197,11 +197,11 @@ def test_a_download_that_broke_off(pwc_weights, tmp_path) -> None:
 
 
 def test_a_missing_file_says_how_to_get_it(tmp_path) -> None:
-    words = "no file is named; fetch .*models fetch pwc_net.* --set flow.model=FILE"
+    words = "is missing; take .*models add pwc_net FILE.*--set flow.model=FILE"
     with pytest.raises(ModelError, match=words):
         load_flow(FlowConfig(name="pwc_net"))
     for path in (tmp_path / "nowhere.pth", tmp_path):
-        with pytest.raises(ModelError, match=f"there is no file {path}; fetch"):
+        with pytest.raises(ModelError, match=f"found nothing at {path}; take"):
             load_flow(FlowConfig(name="pwc_net", model=str(path)))
 
 

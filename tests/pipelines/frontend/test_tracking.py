@@ -1,5 +1,7 @@
 """The tracker in a small hall whose textured walls have exact depth and flow in closed form."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -76,7 +78,7 @@ class Run:
         self.orb = OrbExtractor(config.orb)
         self.last_world = None
 
-    def view(self, T, index, with_flow=False, black=False):
+    def view(self, T, index, with_flow=False, black=False, flow_is_given=True):
         gray, depth, world = look(T)
         flow = None
         if with_flow and self.last_world is not None:
@@ -87,8 +89,12 @@ class Run:
         self.last_world = world
         if black:
             gray = np.zeros_like(gray)
-        frame = Frame(index, 0.1 * index, gray, depth_m=depth, flow_prev_to_curr_px=flow)
-        prepared = prepare_frame(CAMERA, frame, depth, self.orb)
+        frame = Frame(index, 0.1 * index, gray, depth_m=depth)
+        prepared = replace(
+            prepare_frame(CAMERA, frame, depth, self.orb),
+            flow_prev_to_curr_px=flow,
+            flow_is_given=with_flow and flow_is_given,
+        )
         return complete_view(CAMERA, prepared, self.sensor.noise.sigma_disparity_px, 0.0)
 
     def begin(self, T):
@@ -142,6 +148,21 @@ def test_given_flow_makes_pixels_sharper_than_alignment_alone():
             run.track(path(k), k, with_flow=with_flow)
         sigma[with_flow] = run.sensor.noise.sigma_uv_px["flow" if with_flow else "alignment"]
     assert sigma[True] < 0.5 * sigma[False] < 0.25
+
+
+def test_flow_that_was_computed_is_no_measurement_of_the_camera():
+    """It is smooth across edges, and serves objects alone; sharp patches are the camera's."""
+    runs = {}
+    for how in ("none", "computed", "given"):
+        run = runs[how] = Run().begin(path(0))
+        more = {"with_flow": how != "none", "flow_is_given": how == "given"}
+        run.last = [run.track(path(k), k, **more) for k in range(1, 4)][-1]
+    poses = {how: run.last.T_world_camera for how, run in runs.items()}
+    np.testing.assert_array_equal(poses["computed"], poses["none"])
+    assert (poses["given"] != poses["none"]).any()
+    untouched = Run().sensor.noise.sigma_uv_px["flow"]
+    assert runs["computed"].sensor.noise.sigma_uv_px["flow"] == untouched
+    assert runs["given"].sensor.noise.sigma_uv_px["flow"] != untouched
 
 
 def test_tracks_name_living_points_where_they_are():

@@ -1,5 +1,7 @@
 """Views: disparities, static pixels and features with depth, out of a frame."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -36,6 +38,10 @@ def view_of(depth_m, offset_px=0.0, **more):
     return complete(Frame(7, 1.25, textured(), **more), depth_m, offset_px)
 
 
+def masked_view(depth_m, labels, dilation_px=7):
+    return view_of(depth_m).masked(labels, dilation_px)
+
+
 def complete(frame, depth_m, offset_px=0.0):
     return complete_view(CAMERA, prepare_frame(CAMERA, frame, depth_m, ORB), 0.1, offset_px)
 
@@ -47,10 +53,15 @@ def slanted_depth():
 
 
 def test_view_carries_the_frame_along():
-    flow = np.zeros((H, W, 2), np.float32)
-    view = view_of(slanted_depth(), flow_prev_to_curr_px=flow)
+    """And the flow that was chosen for it, not the one that the frame happens to bring."""
+    flow, unused = (np.full((H, W, 2), value, np.float32) for value in (0.0, 9.0))
+    frame = Frame(7, 1.25, textured(), flow_prev_to_curr_px=unused)
+    prepared = prepare_frame(CAMERA, frame, slanted_depth(), ORB)
+    assert complete_view(CAMERA, prepared, 0.1, 0.0).flow_prev_to_curr_px is None
+    prepared = replace(prepared, flow_prev_to_curr_px=flow, flow_is_given=True)
+    view = complete_view(CAMERA, prepared, 0.1, 0.0)
     assert (view.frame_index, view.timestamp_s) == (7, 1.25)
-    assert view.flow_prev_to_curr_px is flow
+    assert view.flow_prev_to_curr_px is flow and view.flow_is_given
     np.testing.assert_array_equal(view.gray, textured())
 
 
@@ -93,7 +104,7 @@ def test_no_depth_at_all_still_gives_features():
 
 def test_depth_of_static_pixels_leaves_movable_ones_out():
     depth = slanted_depth()
-    view = view_of(depth, instance_labels=labelled_box())
+    view = masked_view(depth, labelled_box())
     found = view.depth_of_static_m(CAMERA)
     assert found.dtype == np.float32
     assert np.isnan(found[80:130, 120:200]).all()
@@ -112,16 +123,36 @@ def test_masks_grow_by_the_setting():
 
 
 def test_no_feature_lies_on_a_movable_object():
-    view = view_of(slanted_depth(), instance_labels=labelled_box())
+    view = masked_view(slanted_depth(), labelled_box())
     x, y = np.rint(view.features.uv_px).astype(int).T
     assert len(x) > 150
     assert not labelled_box()[y, x].any()
-    nowhere = view_of(slanted_depth(), instance_labels=np.ones((H, W), np.int32))
+    nowhere = masked_view(slanted_depth(), np.ones((H, W), np.int32))
     assert len(nowhere.features) == 0
 
 
+def test_everything_is_static_until_something_is_said_to_move():
+    """What the sequence masks may stand still: whoever knows says so by `masked`."""
+    view = view_of(slanted_depth(), instance_labels=labelled_box())
+    assert view.static.all()
+    x, y = np.rint(view.features.uv_px).astype(int).T
+    assert (labelled_box()[y, x] > 0).sum() > 10
+    again = view.masked(np.zeros((H, W), np.int32), 7)
+    assert again.static.all() and len(again.features) == len(view.features)
+
+
+def test_features_that_are_left_keep_their_depths():
+    view = view_of(slanted_depth())
+    masked = view.masked(labelled_box(), 7)
+    left = view.is_static(view.features.uv_px) & masked.is_static(view.features.uv_px)
+    assert 0 < left.sum() < len(view.features)
+    np.testing.assert_array_equal(masked.features.uv_px, view.features.uv_px[left])
+    np.testing.assert_array_equal(masked.features.depth_m, view.features.depth_m[left])
+    assert view.static.all()  # the first view is as it was
+
+
 def test_static_places_lie_in_the_image_and_off_objects():
-    view = view_of(None, instance_labels=labelled_box())
+    view = masked_view(None, labelled_box())
     places = np.array([
         [10.0, 10.0], [160.0, 100.0], [-0.4, 0.0], [-0.6, 5.0], [W - 0.6, H - 0.6], [W, 5.0],
         [np.nan, 5.0], [5.0, np.nan],

@@ -37,7 +37,6 @@ def test_place_size_and_centre_of_each_instance(kitti):
     image = np.zeros((*SHAPE, 3), np.uint8)
     found = describe_instances(kitti, image, disparity, detections(one, other, ids=[7, 3]))
     assert len(found) == 2
-    np.testing.assert_array_equal(found.n_pixels, [800, 500])
     np.testing.assert_array_equal(found.boxes_px, [[20, 10, 59, 29], [100, 50, 109, 99]])
     assert found.windows == [one, other]
     assert (found.labels[one] == 1).all() and (found.labels[other] == 2).all()
@@ -53,7 +52,7 @@ def test_an_instance_without_a_pixel_and_an_image_without_instances(kitti):
     hidden = describe_instances(
         kitti, image, disparity, detections((slice(0, 9), slice(0, 9)), (slice(5, 5), slice(0, 0)))
     )
-    assert hidden.windows[1] is None and hidden.n_pixels[1] == 0
+    assert hidden.windows[1] is None and hidden.windows[0] is not None
     assert np.isnan(hidden.boxes_px[1]).all() and np.isnan(hidden.centers_m[1]).all()
     empty = describe_instances(kitti, image, disparity, Detections.empty(SHAPE))
     assert len(empty) == 0 and empty.colors.shape == (0, 64) and not empty.labels.any()

@@ -48,4 +48,9 @@ def test_what_is_known_is_told():
     np.testing.assert_array_equal(rows.Ts_world_object[0, :3, 3], [1, 2, 3])
     np.testing.assert_array_equal(rows.Hs_world_curr_prev[0], H)
     np.testing.assert_array_equal(rows.boxes_px[0], [1, 2, 3, 4])
-    assert rows.velocity_std_mps[0] == pytest.approx(15.0)
+    # Middles of masks alone say nothing of a speed
+    assert np.isnan(rows.velocities_mps).all() and np.isnan(rows.velocity_std_mps).all()
+    track.take_motion(np.eye(4), 1e-4 * np.eye(6), np.array([1.0, 2.0, 3.0]), 0.1)
+    table.add(track, 0.8, center_m=np.array([1.0, 2.0, 3.0]))
+    rows = table.estimates()
+    assert rows.velocity_std_mps[1] == pytest.approx(0.1, rel=0.05)

@@ -136,7 +136,7 @@ def test_no_answer_in_every_second_frame(traffic):
 def passage(board, street_of):
     """A small car drives behind a van that stands: out of sight for some frames."""
     return street_of((
-        board(lambda t: (-2.6 + 4.0 * t, 0.2, 9.0), size_m=(1.2, 0.9)),
+        board(lambda t: (-2.53 + 4.0 * t, 0.2, 9.0), size_m=(1.2, 1.5)),
         board(lambda t: (0.0, 0.0, 7.0), size_m=(1.8, 2.0), seed=2, value=60, name="truck"),
     ))  # fmt: skip
 
@@ -149,7 +149,7 @@ def test_behind_another_it_coasts_and_is_recognised_again(passage):
     assert 2 <= coasting.sum() <= 8
     assert np.isnan(own.boxes_px[coasting]).all() and np.isnan(own.score[coasting]).all()
     k = own.frame_index[coasting]
-    np.testing.assert_allclose(own.centers_m[coasting, 0], -2.6 + 0.4 * k, atol=0.7)
+    np.testing.assert_allclose(own.centers_m[coasting, 0], -2.53 + 0.4 * k, atol=0.7)
     after = own.frame_index > k.max() + 3  # half of it is in sight by then
     assert after.sum() == 7
     assert np.abs(own.speed_mps[after] - 4.0).max() < 0.4
