@@ -93,7 +93,7 @@ def estimate_motions(
     return Motions(
         ids,
         invert_T(found.Ts_body_camera),
-        found.covariances * _redundancy(uv_px, found.inliers, sizes)[:, None, None],
+        found.covariances * _redundancy(uv_px, sizes)[:, None, None],
         sizes,
         found.n_inliers,
         found.inliers,
@@ -101,16 +101,15 @@ def estimate_motions(
     )
 
 
-def _redundancy(uv_px: Array, inliers: NDArray[np.bool_], sizes: NDArray[np.int64]) -> Array:
-    """(J,) factor by which the inliers among points in a row (N, 2) outnumber their witnesses."""
+def _redundancy(uv_px: Array, sizes: NDArray[np.int64]) -> Array:
+    """(J,) factor by which points in a row (N, 2) outnumber their witnesses, outliers included."""
     factor = np.ones(len(sizes))
     end = 0
     for j, n in enumerate(sizes):
-        rows = slice(end, end + int(n))
-        end = rows.stop
-        uv = uv_px[rows][inliers[rows]]
+        uv = uv_px[end : end + int(n)]
+        end += int(n)
         cells = np.unique(np.floor(uv / _CORRELATION_PX) @ (1.0, 1e5))
-        factor[j] = len(uv) / max(len(cells), 1)
+        factor[j] = n / len(cells)
     return factor
 
 

@@ -98,7 +98,7 @@ def choose_pixels(
     gray: (H, W) the whole image. mask: (h, w) the object inside `window`. n_all: points that the
     whole object should have. occupied_px: (K, 2) those it has, whose cells are taken already.
     """
-    inner = _without_rim(mask, window, gray.shape)
+    inner = _without_rim(mask)
     n_pixels, n = int(np.count_nonzero(inner)), n_all - len(occupied_px)
     if n_pixels == 0 or n <= 0:
         return np.empty((0, 2))
@@ -128,22 +128,17 @@ def choose_pixels(
     return uv.astype(np.float64)
 
 
-def _without_rim(
-    mask: NDArray[np.bool_], window: Window, shape: tuple[int, ...]
-) -> NDArray[np.bool_]:
-    """The mask (h, w) less its rim; where the image (H, W) ends it has none, as it may go on."""
+def _without_rim(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask (h, w) less its rim, but for where it ends with its window.
+
+    Its farthest parts, and where the image cuts it, stay: they say most of how the object turns.
+    """
     n_pixels = np.count_nonzero(mask)
     rim_px = next((rim for least, rim in _RIM_PX if n_pixels >= least), 0)
     if rim_px == 0:
         return mask
-    around = tuple(
-        (rim_px * (part.start > 0), rim_px * (part.stop < length))
-        for part, length in zip(window, shape, strict=True)
-    )
-    padded = np.pad(mask.astype(np.uint8), around)
-    inner = cv2.erode(padded, np.ones((2 * rim_px + 1,) * 2, np.uint8), borderValue=1) > 0
-    (top, _), (left, _) = around
-    return inner[top : top + mask.shape[0], left : left + mask.shape[1]]
+    kernel = np.ones((2 * rim_px + 1,) * 2, np.uint8)
+    return cv2.erode(mask.astype(np.uint8), kernel, borderValue=1) > 0
 
 
 def tight_window(mask: NDArray[np.bool_]) -> Window:

@@ -68,30 +68,32 @@ def test_pixels_spread_over_the_whole_object():
     uv = choose_pixels(GRAY, mask, window, 60, NONE)
     quarters = (uv[:, 0] > 85).astype(int) * 2 + (uv[:, 1] > 60)
     assert np.bincount(quarters, minlength=4).min() >= 8
-    cells = np.floor((uv - [30, 20]) / 11).astype(int)  # sqrt(8000 / 60) = 11 px
+    cells = np.floor((uv - [30, 20]) / 12).astype(int)  # sqrt(8800 / 60) = 12 px
     assert len(np.unique(cells, axis=0)) == len(uv)
 
 
 @pytest.mark.parametrize(
     ("size", "rim_px"), [((80, 100), 3), ((40, 40), 2), ((18, 18), 1), ((12, 12), 0)]
 )
-def test_the_rim_is_left_out_on_all_sides(size, rim_px):
-    """A worn mask holds background at its edges, whether they are straight or not."""
+def test_the_rim_is_left_out_and_no_more(size, rim_px):
+    """A worn mask holds background at its edges."""
     top, left = 15, 25
-    mask, window = window_and_mask((top, top + size[0]), (left, left + size[1]))
+    mask, window = window_and_mask((top - 8, top + size[0] + 8), (left - 8, left + size[1] + 8))
+    mask[:8], mask[-8:], mask[:, :8], mask[:, -8:] = False, False, False, False
     uv = choose_pixels(GRAY, mask, window, 2000, NONE)
     assert uv[:, 0].min() >= left + rim_px and uv[:, 1].min() >= top + rim_px
     assert uv[:, 0].max() <= left + size[1] - 1 - rim_px
     assert uv[:, 1].max() <= top + size[0] - 1 - rim_px
-    # and no more than the rim is left out
     assert uv[:, 0].min() <= left + rim_px + 2 and uv[:, 1].min() <= top + rim_px + 2
 
 
-def test_an_object_cut_by_the_image_has_no_rim_there():
+def test_where_a_mask_ends_with_its_window_it_has_no_rim():
     mask, window = window_and_mask((60, 120), (0, 100))
+    mask[:20, 50:] = False
     uv = choose_pixels(GRAY, mask, window, 2000, NONE)
-    assert uv[:, 0].min() <= 1 and uv[:, 1].max() >= 118
-    assert uv[:, 0].max() <= 96 and uv[:, 1].min() >= 63
+    assert uv[:, 0].min() <= 1 and uv[:, 1].max() >= 118 and uv[:, 0].max() >= 98
+    inner_corner = (uv[:, 0] > 46) & (uv[:, 1] < 83)
+    assert not inner_corner.any()
 
 
 def test_where_an_object_has_points_no_new_ones_are_taken():
