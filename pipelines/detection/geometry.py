@@ -83,8 +83,11 @@ class MultiViewGeometry:
             self._memory.add_keyframe(self._last_static)
 
     def rename(self, names: Mapping[int, int]) -> None:
-        """Call instances of the last answer by the labels that they have from now on."""
-        self._belief = {names.get(label, label): b for label, b in self._belief.items()}
+        """Call instances of the last answer by the labels that they have from now on.
+
+        names: label then -> label now, of all that go on; what is not named is forgotten.
+        """
+        self._belief = {names[label]: b for label, b in self._belief.items() if label in names}
 
     def segment(self, view: GeometryView, known: Detections) -> Detections:
         """Instances of the present frame: the known ones, repaired, and new ones that move.

@@ -128,8 +128,6 @@ def estimate_poses(
         Ts = problem.minimise(Ts, used, True, max_steps)
         problem.allow_for_noise(Ts)
         used = problem.chi2(Ts) <= problem.limit
-        if (problem.count(used) < _MIN_POINTS).all():
-            break
     Ts = problem.minimise(Ts, used, False, max_steps)
     residuals, chi2 = problem.residuals(Ts), problem.chi2(Ts)
     used = chi2 <= problem.limit
@@ -213,7 +211,10 @@ class _Problem:
         self.camera = camera
         ends = np.cumsum(sizes)
         self.bodies = [slice(int(end - n), int(end)) for n, end in zip(sizes, ends, strict=True)]
-        self.points = np.ascontiguousarray(observations.points_world_m.T)
+        known = np.isfinite(observations.points_world_m).all(axis=1)
+        known &= np.isfinite(observations.uvr_px[:, :2]).all(axis=1)
+        self.points = observations.points_world_m.T.copy()
+        self.points[:, ~known] = 0.0
         self.mono = np.isnan(observations.uvr_px[:, 2])
         self.uvr = np.nan_to_num(observations.uvr_px).T.copy()
         self.limit = np.where(self.mono, CHI2_95_2DOF, CHI2_95_3DOF)
@@ -222,7 +223,7 @@ class _Problem:
         R = Ts[0, :3, :3] if len(Ts) == 1 else np.repeat(Ts[:, :3, :3], sizes, axis=0)
         W = whitening(_residual_covariance(camera, points_camera, R, observations))
         W[self.mono, 2] = 0.0  # the first two rows do not know of the third
-        self.usable = visible & np.isfinite(W).all(axis=(1, 2))
+        self.usable = known & visible & np.isfinite(W).all(axis=(1, 2))
         W[~self.usable] = 0.0  # nothing is known of a projection from behind
         self.W = W.transpose(1, 2, 0).copy()
 

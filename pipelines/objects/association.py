@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from pipelines.object_types import UNNAMED_CLASS
 from pipelines.types import Array
 
 _MIN_VOTES = 0.3  # share of an object's points that a detection must hold
 _FEW_POINTS = 5  # fewer votes say little, boxes then count as well
-_MIN_OVERLAP = 0.2  # intersection over union with the predicted box, where points are few
+_MIN_OVERLAP = 0.2  # intersection over union with the last box, where points are few
 _GATE = 16.3  # chi-square, 3 degrees of freedom, 99.9 %
 _UNLIKELY = 20.0  # of distance2 + log_spread, where only the colour still counts
 _MAX_COLOR_DISTANCE = 0.6  # Hellinger, of something found again
@@ -34,8 +35,8 @@ class Candidates:
     """What speaks for each pair of J objects and M detections.
 
     votes: (J, M) how far the object's tracked points and the detection are the same, 0 without
-    points; see `count_votes`. n_points: (J,) tracked points. overlap: (J, M) of the last box with
-    the detection's.
+    points; see `count_votes`. n_points: (J,) tracked points. overlap: (J, M) of the object's last
+    box with the detection's, intersection over union, 0 where it has none.
     distance2: (J, M) squared Mahalanobis distance of the centres, inf where unknown. log_spread:
     (J, M) logarithm of the determinant of its covariance: who may be anywhere is likely nowhere.
     color_distance: (J, M) Hellinger distance 0..1. same_kind: (J, M) whether classes agree.
@@ -53,8 +54,9 @@ class Candidates:
 def assign(candidates: Candidates) -> NDArray[np.int64]:
     """(J,) row of the detection of each object, -1 where it has none. One Hungarian assignment.
 
-    Votes decide where there are any (cost 0 to 1); else the box or the filter's gate (1 to 2), so
-    that an object in sight never loses its detection to one that is found again.
+    Votes cost 0 to 0.7, boxes 0.5 to 1.3 and the filter's gate 1.5 to 2, so that what a vote would
+    lose by going elsewhere is always more than what finding another object again would gain: an
+    object in sight never loses its detection to one that is found again.
     """
     c = candidates
     cost = np.full(c.votes.shape, _NO_MATCH)
@@ -62,7 +64,7 @@ def assign(candidates: Candidates) -> NDArray[np.int64]:
         return np.full(len(cost), -1, np.int64)
     again = (c.distance2 <= _GATE) & c.same_kind & (c.color_distance <= _MAX_COLOR_DISTANCE)
     unlikely = np.clip((c.distance2 + c.log_spread) / _UNLIKELY, 0.0, 0.99)
-    cost[again] = 1.0 + 0.6 * unlikely[again] + 0.4 * c.color_distance[again]
+    cost[again] = 1.5 + 0.3 * unlikely[again] + 0.2 * c.color_distance[again]
     near = (c.n_points[:, None] < _FEW_POINTS) & (c.overlap >= _MIN_OVERLAP) & c.same_kind
     cost = np.where(near, np.minimum(cost, 1.5 - c.overlap), cost)
     voted = (c.votes >= _MIN_VOTES) & (c.n_points[:, None] > 0)
@@ -124,6 +126,5 @@ def same_kind(a: list[str], b: list[str]) -> NDArray[np.bool_]:
         return next((i for i, group in enumerate(_GROUPS) if name in group), name)
 
     known_a, known_b = [kind(x) for x in a], [kind(x) for x in b]
-    unnamed = "object"
-    pairs = [[x == y or unnamed in (x, y) for y in known_b] for x in known_a]
+    pairs = [[x == y or UNNAMED_CLASS in (x, y) for y in known_b] for x in known_a]
     return np.array(pairs, bool).reshape(len(a), len(b))

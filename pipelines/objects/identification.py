@@ -24,7 +24,7 @@ from pipelines.objects.association import (
 from pipelines.objects.following import Followed
 from pipelines.objects.frame import LastObjects
 from pipelines.objects.instances import Instances, carry_mask
-from pipelines.objects.points import ObjectPoints, Window
+from pipelines.objects.points import ObjectPoints, Window, tight_window
 from pipelines.objects.track import ObjectTrack
 from pipelines.types import Array
 
@@ -54,7 +54,7 @@ def identify(
     distance2, log_spread = _distances(
         tracks, transform_points(T_world_camera, instances.centers_m)
     )
-    boxes = np.array([tracks[i].box_px for i in ids]).reshape(len(ids), 4)
+    boxes = np.array([tracks[i].fresh_box_px for i in ids]).reshape(len(ids), 4)
     colors = np.array([tracks[i].color for i in ids]).reshape(len(ids), instances.colors.shape[1])
     kinds = same_kind([tracks[i].class_name for i in ids], [str(n) for n in instances.class_names])
     found = assign(
@@ -110,4 +110,9 @@ def carry_missed(
     if np.count_nonzero(free) < _MIN_CARRIED_SHARE * np.count_nonzero(mask):
         return None
     labels[window][free] = track.object_id
-    return window
+    rows, columns = tight_window(free)
+    top, left = window[0].start, window[1].start
+    return (
+        slice(top + rows.start, top + rows.stop),
+        slice(left + columns.start, left + columns.stop),
+    )

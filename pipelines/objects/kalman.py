@@ -49,11 +49,6 @@ class ObjectFilter:
         return self._kf.x[3:].copy()
 
     @property
-    def center_covariance_m2(self) -> Array:
-        """(3, 3)."""
-        return self._kf.P[:3, :3].copy()
-
-    @property
     def velocity_covariance(self) -> Array:
         """(3, 3), (m/s)^2."""
         return self._kf.P[3:, 3:].copy()
@@ -68,7 +63,7 @@ class ObjectFilter:
         R = rotation_of(self.turn_radps * dt_s)
         half = rotation_of(self.turn_radps * (0.5 * dt_s))
         F = np.eye(6)
-        F[:3, 3:] = dt_s * half  # the chord of the arc
+        F[:3, 3:] = dt_s * half  # the chord of the arc lies half-way between both directions
         F[3:, 3:] = R
         # White acceleration, constant over the step
         G = np.vstack([0.5 * dt_s**2 * np.eye(3), dt_s * np.eye(3)])
@@ -87,27 +82,32 @@ class ObjectFilter:
         center_covariance_m2: Array,
         velocity_mps: Array,
         velocity_covariance: Array,
+        *,
         turn_radps: Array,
+        dt_s: float,
     ) -> None:
-        """Take in a measured motion: centre (3,) now, mean velocity (3,) over the last step.
+        """Take in a measured motion: centre (3,) now, mean velocity (3,) over the last `dt_s`.
 
-        turn_radps: (3,) rotation vector per second, in the world. A centre or velocity outside
+        turn_radps: (3,) rotation vector per second, in the world. The mean velocity of a turning
+        object points to where it went half a step ago. A centre or velocity outside
         its 99 % gate counts as less certain, just so much that it lies about on the gate: one wild
         motion does not carry the filter away, and several that agree do.
         """
+        turn = _TURN_MEMORY * self.turn_radps + (1.0 - _TURN_MEMORY) * turn_radps
+        self.turn_radps = turn * min(1.0, _MAX_TURN_RADPS / max(float(np.linalg.norm(turn)), 1e-9))
+        H = np.eye(6)
+        H[3:, 3:] = rotation_of(self.turn_radps * (-0.5 * dt_s))
         z = np.r_[center_m, velocity_mps]
+        residual, P = z - H @ self._kf.x, H @ self._kf.P @ H.T
         R = np.zeros((6, 6))
         for part, covariance in (
             (slice(0, 3), center_covariance_m2),
             (slice(3, 6), velocity_covariance),
         ):
-            innovation = (z - self._kf.x)[part]
-            S = self._kf.P[part, part] + covariance
-            distance2 = float(innovation @ np.linalg.solve(S, innovation))
+            innovation = residual[part]
+            distance2 = float(innovation @ np.linalg.solve(P[part, part] + covariance, innovation))
             R[part, part] = covariance * max(1.0, distance2 / _GATE)
-        self._kf.update(z, R=R, H=np.eye(6))
-        turn = _TURN_MEMORY * self.turn_radps + (1.0 - _TURN_MEMORY) * turn_radps
-        self.turn_radps = turn * min(1.0, _MAX_TURN_RADPS / max(float(np.linalg.norm(turn)), 1e-9))
+        self._kf.update(z, R=R, H=H)
 
     def update_center(self, center_m: Array, covariance_m2: Array) -> None:
         """Take in a centre (3,) alone, where no motion could be measured."""

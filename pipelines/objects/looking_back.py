@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipelines.frontend.view import View
 from pipelines.objects.frame import LastObjects, ObjectFrame
-from pipelines.objects.points import choose_pixels
+from pipelines.objects.points import choose_pixels, tight_window
 from pipelines.objects.search import match_masks
 from pipelines.objects.solver import MotionSolver
 from pipelines.types import Array
@@ -33,7 +33,7 @@ def seed_pixels(
     """
     H, W = flow_px.shape[:2]
     v, u = np.mgrid[0:H:_GRID_PX, 0:W:_GRID_PX]
-    to = np.nan_to_num(flow_px[::_GRID_PX, ::_GRID_PX], nan=1e6)
+    to = np.nan_to_num(flow_px[::_GRID_PX, ::_GRID_PX], nan=1e6, posinf=1e6, neginf=1e6)
     x, y = np.rint(u + to[..., 0]).astype(np.int64), np.rint(v + to[..., 1]).astype(np.int64)
     inside = (x >= 0) & (y >= 0) & (x < W) & (y < H)
     label = np.where(inside, frame.labels[np.clip(y, 0, H - 1), np.clip(x, 0, W - 1)], 0)
@@ -47,13 +47,12 @@ def seed_pixels(
 
 def _pixels_on_grid(view: View, on_grid: NDArray[np.bool_], n: int) -> Array:
     """Pixels (N, 2) of a view for points of an object that covers these nodes of the grid."""
-    rows, columns = np.flatnonzero(on_grid.any(1)), np.flatnonzero(on_grid.any(0))
-    if len(rows) == 0:
+    if not on_grid.any():
         return np.empty((0, 2))
-    part = on_grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    mask = np.repeat(np.repeat(part, _GRID_PX, axis=0), _GRID_PX, axis=1)
+    nodes = tight_window(on_grid)
+    mask = np.repeat(np.repeat(on_grid[nodes], _GRID_PX, axis=0), _GRID_PX, axis=1)
     H, W = view.gray.shape
-    y0, x0 = int(rows[0]) * _GRID_PX, int(columns[0]) * _GRID_PX
+    y0, x0 = nodes[0].start * _GRID_PX, nodes[1].start * _GRID_PX
     mask = mask[: H - y0, : W - x0]
     window = (slice(y0, y0 + mask.shape[0]), slice(x0, x0 + mask.shape[1]))
     return choose_pixels(view.gray, mask, window, n, np.empty((0, 2)))

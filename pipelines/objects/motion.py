@@ -11,13 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.frontend.hypotheses import estimate_pnp
+from pipelines.frontend.hypotheses import estimate_pnp, reprojection_inliers
 from pipelines.frontend.motion_only_ba import estimate_poses
 from pipelines.geometry import (
-    MIN_DEPTH_M,
     invert_T,
     make_T,
-    project_stereo,
+    reprojection_errors,
     rotation_of,
     rotation_vector,
     skew,
@@ -33,7 +32,7 @@ _WEAK_SHARE = 0.7  # of inliers, below which PnP RANSAC competes
 _MIN_PNP_POINTS = 8
 GATE_6DOF = 16.8  # chi-square, 6 degrees of freedom, 99 %
 # Errors of flow are alike over a patch, so that N points are not N witnesses: two of them count
-# as one where they are nearer than this. Measured by the errors of simulated drives.
+# as one where they share a cell of this size. Measured by the errors of simulated drives.
 _CORRELATION_PX = 20.0
 
 
@@ -73,18 +72,17 @@ def estimate_motions(
     as much as all the rest.
     """
     ids, sizes = points.groups()
-    guesses, share = _best_hypotheses(camera, points, observations.uvr_px[:, :2], hypotheses, sizes)
+    uv_px = observations.uvr_px[:, :2]
+    guesses, share = _best_hypotheses(camera, points, uv_px, hypotheses, sizes)
     ends = np.cumsum(sizes)
     for j in np.flatnonzero((share < _WEAK_SHARE) & (sizes >= _MIN_PNP_POINTS)):
         rows = slice(int(ends[j] - sizes[j]), int(ends[j]))
-        uv = observations.uvr_px[rows, :2]
-        T = estimate_pnp(camera, points.position_m[rows], uv, _INLIER_PX, seed)
+        positions, uv = points.position_m[rows], uv_px[rows]
+        T = estimate_pnp(camera, positions, uv, _INLIER_PX, seed)
         if T is None:
             continue
-        G = invert_T(T)
-        rival = _inliers(camera, G[None], points.position_m[rows], uv, sizes[j : j + 1]).mean()
-        if rival > share[j]:
-            guesses[j] = G
+        if reprojection_inliers(camera, T, positions, uv, _INLIER_PX).mean() > share[j]:
+            guesses[j] = invert_T(T)
     found = estimate_poses(
         camera,
         invert_T(guesses),
@@ -97,7 +95,7 @@ def estimate_motions(
     return Motions(
         ids,
         invert_T(found.Ts_body_camera),
-        found.covariances * _redundancy(observations.uvr_px[:, :2], sizes)[:, None, None],
+        found.covariances * _redundancy(uv_px, sizes)[:, None, None],
         sizes,
         found.n_inliers,
         found.inliers,
@@ -106,7 +104,7 @@ def estimate_motions(
 
 
 def _redundancy(uv_px: Array, sizes: NDArray[np.int64]) -> Array:
-    """(J,) factor by which points in a row (N, 2) are more than independent witnesses."""
+    """(J,) factor by which points in a row (N, 2) outnumber their witnesses, outliers included."""
     factor = np.ones(len(sizes))
     end = 0
     for j, n in enumerate(sizes):
@@ -142,10 +140,8 @@ def _inliers(
 ) -> Array:
     """(N,) 1.0 where a point, moved by its object's G, reprojects to where it was seen."""
     moved = move_points(Gs, points_m, sizes)
-    front = moved[:, 2] > MIN_DEPTH_M
-    moved[~front, 2] = 1.0
-    error = np.linalg.norm(project_stereo(camera, moved)[:, :2] - uv_px, axis=1)
-    return (front & (error <= _INLIER_PX)).astype(np.float64)
+    error = reprojection_errors(camera, np.eye(4), moved, uv_px)
+    return (error <= _INLIER_PX).astype(np.float64)
 
 
 def move_points(Gs: Array, points_m: Array, sizes: NDArray[np.int64]) -> Array:
@@ -216,10 +212,9 @@ def fuse_motions(
 ) -> FusedMotion:
     """The motion between an expected (4, 4) and a measured one (4, 4).
 
-    Covariances as of `world_covariance`;
-    center_m: (3,) the object's centre before the motion. One
+    Covariances as of `world_covariance`. center_m: (3,) the object's centre before the motion. One
     step of a Kalman filter: matter does not change its motion at once. A measurement outside its
-    99 % gate counts as less certain, just so much that it lies on the gate.
+    99 % gate is answered as it is, and whether to believe it is left to who asked.
     Deviation: the paper keeps the measured motion. This changes it only where it is less certain
     than the expectation, as with few or far points.
     """

@@ -22,7 +22,8 @@ def decide_by_speed(
 
     Moving: above the least speed by `significance` standard deviations. Stopped: surely below it.
     Between them what was known before stays, if the speed does not contradict it: a moving object
-    stays so down to half of the least speed, a stopped one until it surely moves.
+    stays so down to half of the least speed, by one standard deviation, and a stopped one until it
+    surely moves.
     Deviation: the paper's threshold is in m a frame, whatever the frame rate and the distance.
     """
     low, sigma = config.min_speed_mps, std_mps

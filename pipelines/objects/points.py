@@ -19,7 +19,7 @@ from pipelines.frontend.sampling import sample_disparity
 from pipelines.mapping.point_filter import make_points
 from pipelines.types import Array, Image, StereoCamera
 
-Window = tuple[slice, slice]
+Window = tuple[slice, slice]  # rows and columns of an image
 _CORNER_WINDOW_PX = 5  # of the structure tensor that ranks pixels
 _MIN_CELL_PX, _MAX_CELL_PX = 2, 12
 _AREA_PER_POINT_PX, _FEWEST_POINTS = 36, 24
@@ -129,10 +129,19 @@ def choose_pixels(
 
 
 def _without_rim(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask (h, w) less its rim, but for where it ends with its window.
+
+    Its farthest parts, and where the image cuts it, stay: they say most of how the object turns.
+    """
     n_pixels = np.count_nonzero(mask)
-    for least, rim_px in _RIM_PX:
-        if n_pixels >= least:
-            size = 2 * rim_px + 1
-            kernel = np.ones((size, size), np.uint8)
-            return cv2.erode(mask.astype(np.uint8), kernel, borderValue=1) > 0
-    return mask
+    rim_px = next((rim for least, rim in _RIM_PX if n_pixels >= least), 0)
+    if rim_px == 0:
+        return mask
+    kernel = np.ones((2 * rim_px + 1,) * 2, np.uint8)
+    return cv2.erode(mask.astype(np.uint8), kernel, borderValue=1) > 0
+
+
+def tight_window(mask: NDArray[np.bool_]) -> Window:
+    """Where the pixels of a mask (h, w) lie in it. It must have some."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

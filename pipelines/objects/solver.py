@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import ObjectsConfig
-from pipelines.frontend.hypotheses import estimate_pnp
+from pipelines.frontend.hypotheses import estimate_pnp, reprojection_inliers
 from pipelines.frontend.sampling import sample_disparity
 from pipelines.frontend.sensor import Sensor
-from pipelines.geometry import MIN_DEPTH_M, invert_T, project_stereo, transform_points
+from pipelines.geometry import backproject, invert_T
 from pipelines.mapping.point_filter import refine_points
 from pipelines.objects.following import Followed
 from pipelines.objects.instances import middle_of
@@ -136,20 +136,12 @@ class MotionSolver:
         good = disparity >= self.sensor.min_disparity_px
         if good.sum() < self.config.min_points:
             return None
-        z = self.camera.bf / disparity[good]
-        x = (uv_prev_px[good, 0] - self.camera.cx) / self.camera.fx * z
-        y = (uv_prev_px[good, 1] - self.camera.cy) / self.camera.fy * z
-        points = np.stack([x, y, z], -1)
+        points = backproject(self.camera, uv_prev_px[good], self.camera.bf / disparity[good])
         T = estimate_pnp(self.camera, points, uv_px[good], _SEARCH_INLIER_PX, self._seed)
         if T is None:
             return None
-        G = invert_T(T)
-        moved = transform_points(G, points)
-        front = moved[:, 2] > MIN_DEPTH_M
-        moved[~front, 2] = 1.0
-        error = np.linalg.norm(project_stereo(self.camera, moved)[:, :2] - uv_px[good], axis=1)
-        agree = front & (error <= _SEARCH_INLIER_PX)
-        return G if agree.mean() >= _MIN_SEARCH_SHARE else None
+        agree = reprojection_inliers(self.camera, T, points, uv_px[good], _SEARCH_INLIER_PX)
+        return invert_T(T) if agree.mean() >= _MIN_SEARCH_SHARE else None
 
 
 def on_one_surface(
@@ -157,7 +149,8 @@ def on_one_surface(
 ) -> NDArray[np.bool_]:
     """(N,) which points are about as far as most of their object's: a worn mask holds others too.
 
-    Their disparity is within five median deviations, or 15 %, of the object's median.
+    Their disparity is within five median deviations, or 15 %, of the object's median, or so near
+    as its noise allows beyond that.
     """
     disparity = camera.bf / points.position_m[:, 2]
     near = np.zeros(len(points), bool)

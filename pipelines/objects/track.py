@@ -90,6 +90,11 @@ class ObjectTrack:
         return self.T_world_object[:3, :3] @ middle + self.T_world_object[:3, 3]
 
     @property
+    def fresh_box_px(self) -> Array:
+        """(4,) its last box, NaN where it was missed for so long that it will be elsewhere."""
+        return self.box_px if self.missed_s <= self.config.max_carried_s else np.full(4, np.nan)
+
+    @property
     def is_anchored(self) -> bool:
         """Whether its pose is tied to its matter: its motion was measured a moment ago."""
         return self.has_motion and self.unmeasured_s <= _MAX_SLIP_S
@@ -124,14 +129,19 @@ class ObjectTrack:
         return since is not None and timestamp_s - since >= self.config.still_after_s
 
     def predicted_motion(self, dt_s: float) -> Array:
-        """H (4, 4) over the next `dt_s`: the last motion goes on, else what the filter says."""
+        """H (4, 4) over a time: the last motion goes on, else what the filter says.
+
+        The filter has been moved on by `dt_s` already: the motion leads to where it is now.
+        """
         if self.filter is None:
             return np.eye(4)
-        center = self.filter.center_m
-        if self.H_world_curr_prev is not None and self.H_dt_s > 0.0:
+        turn = self.filter.turn_radps * dt_s
+        way_m = rotation_of(-0.5 * turn) @ self.filter.velocity_mps * dt_s
+        center = self.filter.center_m - way_m
+        if self.H_world_curr_prev is not None:
             return scale_about(self.H_world_curr_prev, center, dt_s / self.H_dt_s)
-        R = rotation_of(self.filter.turn_radps * dt_s)
-        return make_T(R, center + self.filter.velocity_mps * dt_s - R @ center)
+        R = rotation_of(turn)
+        return make_T(R, center + way_m - R @ center)
 
     def expected_motion(self, center_m: Array, dt_s: float) -> tuple[Array, Array]:
         """What motion (4, 4) to expect in a time, with covariance (6, 6), before it is measured.
@@ -178,7 +188,7 @@ class ObjectTrack:
             self.filter.move_to(origin, loose)
         self.filter.update_motion(
             origin, loose, (origin - before) / dt_s, covariance_m2 / dt_s**2,
-            rotation_vector(H) / dt_s,
+            turn_radps=rotation_vector(H) / dt_s, dt_s=dt_s,
         )  # fmt: skip
         self.H_world_curr_prev, self.H_dt_s, self.H_covariance = H, dt_s, covariance
         self.unmeasured_s = 0.0

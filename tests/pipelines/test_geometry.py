@@ -18,6 +18,7 @@ from pipelines.geometry import (
     projection_jacobian,
     q_xyzw_from_T,
     rotation_angle_deg,
+    rotation_vector,
     skew,
     transform_points,
 )
@@ -157,3 +158,23 @@ def test_inside_image_counts_the_edges_in():
     assert inside_image(CAMERA, corners).tolist() == [True, True, False, False, False]
     assert not inside_image(CAMERA, corners, border_px=1.0).any()
     assert inside_image(CAMERA, np.array([[1.0, 398.0]]), border_px=1.0).all()
+
+
+@pytest.mark.parametrize("shape", [(5,), (2, 3), (0,), (1,)])
+def test_exponentials_of_a_batch_are_those_of_each(shape):
+    xi = np.random.default_rng(30).normal(size=(*shape, 6))
+    xi.reshape(-1, 6)[:1, :3] *= 1e-12  # one hardly turns, and the rest do
+    Ts = exp_se3(xi)
+    assert Ts.shape == (*shape, 4, 4)
+    for index in np.ndindex(shape):
+        np.testing.assert_allclose(Ts[index], exp_se3(xi[index]), atol=1e-14)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-10, 1e-3, 1.0, 3.1])
+def test_rotation_vectors_undo_the_exponential(angle):
+    axes = np.random.default_rng(31).normal(size=(2, 3, 3))
+    omega = angle * axes / np.linalg.norm(axes, axis=-1, keepdims=True)
+    xi = np.concatenate([omega, np.ones_like(omega)], -1)
+    np.testing.assert_allclose(rotation_vector(exp_se3(xi)), omega, atol=1e-9)
+    assert rotation_vector(exp_se3(xi[0, 0])).shape == (3,)
+    assert rotation_vector(np.empty((0, 4, 4))).shape == (0, 3)

@@ -347,3 +347,30 @@ def test_the_overtaking_car_of_kitti_is_found_and_parked_ones_are_not(real_data)
         assert 0.5 < best < 0.999, f"frame {k}"
         for mask in masks:
             assert (labels[mask] == 1).mean() > 0.5, f"frame {k}: a false mover"
+
+
+def test_beliefs_follow_their_instances_to_other_labels():
+    """A nameless instance that stands fades from where it was, under whatever label it goes on."""
+
+    def frames_until_dropped(new_label: int, told: bool) -> int:
+        geometry = MultiViewGeometry(CAMERA, GeometryConfig())
+        for k in range(6):  # it moves, and is found
+            found = geometry.segment(two_planes(k, 0.16)[0], nothing())
+        assert len(found) == 1
+        old = int(found.label_ids[0])
+        labels = np.where(found.labels == old, new_label, 0).astype(np.int32)
+        if told:
+            geometry.rename({old: new_label})
+        known = Detections(labels, np.array([new_label], np.int32), found.class_names, np.ones(1))
+        still, _ = two_planes(5, 0.16)
+        flow = np.zeros((CAMERA.height, CAMERA.width, 2), np.float32)
+        for k in range(6, 30):
+            view = replace(still, frame_index=k, timestamp_s=k * DT_S, flow_prev_to_curr_px=flow)
+            known = geometry.segment(view, known)
+            if len(known) == 0:
+                return k
+        return 30
+
+    told = frames_until_dropped(5, True)
+    assert told == frames_until_dropped(41, True)
+    assert frames_until_dropped(5, False) != told  # else its old belief is lost

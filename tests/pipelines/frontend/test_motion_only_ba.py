@@ -10,6 +10,7 @@ from pipelines.frontend.motion_only_ba import (
     CHI2_95_2DOF,
     CHI2_95_3DOF,
     estimate_camera_pose,
+    estimate_poses,
     observation_covariance,
     whitening,
 )
@@ -277,3 +278,115 @@ def test_a_gate_keeps_a_crowd_that_moves_alike_from_dragging_the_pose():
     still = estimate_camera_pose(CAMERA, near, observations[np.arange(80, 200)])
     assert error_m_deg(gated.T_world_camera)[0] < 1.5 * error_m_deg(still.T_world_camera)[0] + 1e-3
     assert not gated.inliers[:80].any()
+
+
+# ----------------------------------------------------------------- many bodies
+
+
+def join(parts):
+    names = parts[0].__slots__
+    rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return replace(parts[0], **rows), np.array([len(part) for part in parts])
+
+
+def bodies(rng, sizes):
+    """Observations of bodies of these sizes, their guesses, and what each is when solved alone."""
+    parts = [observe(rng, n, point_noise=0.02) for n in sizes]
+    parts = [without_disparity(part, rng.random(len(part)) < 0.3) for part in parts]
+    guesses = np.stack([GUESS @ exp_se3(rng.normal(0, 0.01, 6)) for _ in sizes])
+    alone = [estimate_camera_pose(CAMERA, T, part) for T, part in zip(guesses, parts, strict=True)]
+    return parts, guesses, alone
+
+
+def assert_same(found, sizes, j, alone):
+    """Body j of many is what it is when solved alone."""
+    end = int(np.sum(sizes[: j + 1]))
+    rows = slice(end - int(sizes[j]), end)
+    pairs = {
+        "pose": (found.Ts_body_camera[j], alone.T_world_camera),
+        "covariance": (found.covariances[j], alone.covariance),
+        "chi2": (found.chi2[rows], alone.chi2),
+        "residuals": (found.residuals_px[rows], alone.residuals_px),
+    }
+    for name, (ours, theirs) in pairs.items():
+        np.testing.assert_allclose(ours, theirs, rtol=1e-7, atol=1e-9, err_msg=name)
+    np.testing.assert_array_equal(found.inliers[rows], alone.inliers)
+    assert found.n_inliers[j] == alone.n_inliers
+
+
+@pytest.mark.parametrize("sizes", [(80, 40, 150), (60, 0, 3, 30), (1, 2, 3, 4, 5, 50), (7,)])
+def test_many_bodies_at_once_are_each_as_alone(sizes):
+    """Empty bodies and such of some points neither fail nor disturb the others."""
+    parts, guesses, alone = bodies(np.random.default_rng(20), sizes)
+    observations, n = join(parts)
+    found = estimate_poses(CAMERA, guesses, observations, n)
+    for j, one in enumerate(alone):
+        assert_same(found, n, j, one)
+        assert np.isnan(found.covariances[j]).any() == (sizes[j] < 6)
+    assert np.isfinite(found.Ts_body_camera).all()
+
+
+def test_no_body_at_all():
+    observations = observe(np.random.default_rng(21), 0)
+    found = estimate_poses(CAMERA, np.empty((0, 4, 4)), observations, np.empty(0, np.int64))
+    assert found.Ts_body_camera.shape == (0, 4, 4) and found.covariances.shape == (0, 6, 6)
+
+
+@pytest.mark.parametrize("harm", ["shuffled", "behind", "nan points", "nan pixels", "far guess"])
+def test_one_body_that_diverges_does_not_disturb_the_others(harm):
+    rng = np.random.default_rng(22)
+    parts, guesses, alone = bodies(rng, (60, 40, 50))
+    bad = parts[1]
+    points, uvr = bad.points_world_m.copy(), bad.uvr_px.copy()
+    if harm == "shuffled":
+        uvr = rng.permutation(uvr)
+    elif harm == "behind":
+        points = transform_points(T_TRUE, -transform_points(invert_T(T_TRUE), points))
+    elif harm == "nan points":
+        points[::2] = np.nan
+    elif harm == "nan pixels":
+        uvr[::2] = np.nan
+    else:
+        guesses[1] = exp_se3(np.array([0.0, 3.0, 0.0, 500.0, 0.0, -900.0]))
+    parts[1] = replace(bad, points_world_m=points, uvr_px=uvr)
+    observations, n = join(parts)
+    found = estimate_poses(CAMERA, guesses, observations, n)
+    assert_same(found, n, 0, alone[0])
+    assert_same(found, n, 2, alone[2])
+    if harm.startswith("nan"):  # the other half of its points is as good as ever
+        assert 15 <= found.n_inliers[1] <= 20
+        assert error_m_deg(found.Ts_body_camera[1])[0] < 0.2
+        assert not found.inliers[60:100:2].any()
+    elif harm == "behind":
+        assert found.n_inliers[1] == 0
+
+
+def test_covariances_of_many_bodies_are_their_spread():
+    """Monte Carlo over 100 runs of three bodies; rejection at 95 % costs a little more."""
+    sizes, nees = (40, 100, 200), []
+    rng = np.random.default_rng(23)
+    for _ in range(100):
+        observations, n = join([observe(rng, size) for size in sizes])
+        found = estimate_poses(CAMERA, np.repeat(GUESS[None], 3, axis=0), observations, n)
+        errors = [twist_error(T) for T in found.Ts_body_camera]
+        nees.append(
+            [e @ np.linalg.solve(C, e) for e, C in zip(errors, found.covariances, strict=True)]
+        )
+    mean = np.mean(nees, axis=0)
+    assert (mean > 4.8).all() and (mean < 9.0).all(), mean
+
+
+def test_a_gate_keeps_out_what_would_drag_the_cost_along():
+    """45 % of a body's points share another motion; from a good guess the gate leaves them out."""
+    rng, errors = np.random.default_rng(24), {np.inf: [], 4.0: []}
+    guess = T_TRUE @ exp_se3(np.array([1e-4, 1e-4, 0, 0.002, 0.0, 0.01]))
+    for _ in range(10):
+        observations = observe(rng, 100)
+        uvr = observations.uvr_px.copy()
+        uvr[:45] += [6.0, 2.0, 6.0]
+        observations = replace(observations, uvr_px=uvr)
+        for gate_px, found in errors.items():
+            T = estimate_camera_pose(CAMERA, guess, observations, gate_px=gate_px).T_world_camera
+            found.append(error_m_deg(T)[0])
+    assert 1e-3 < np.mean(errors[4.0]) < 0.06
+    assert np.mean(errors[4.0]) < 0.5 * np.mean(errors[np.inf])

@@ -74,3 +74,23 @@ def test_models_do_not_share_their_tables():
     a, b = NoiseModel(), NoiseModel()
     a.learn_uv("flow", np.full((100, 2), 1.0))
     assert b.sigma_uv_px["flow"] != a.sigma_uv_px["flow"]
+
+
+def test_a_source_begins_with_what_another_has_learned():
+    noise = NoiseModel()
+    noise.learn_uv("flow", np.full((100, 2), 0.1))
+    noise.borrow("object_flow", "flow")
+    assert noise.sigma_uv_px["object_flow"] == noise.sigma_uv_px["flow"] != 0.3
+    noise.learn_uv("object_flow", np.full((100, 2), 0.4))  # the first of its own replace it
+    assert noise.sigma_uv_px["object_flow"] == pytest.approx(0.4 * 1.4826)
+
+
+def test_nothing_is_borrowed_from_a_guess_nor_by_who_knows():
+    noise = NoiseModel()
+    noise.borrow("object_flow", "flow")
+    assert noise.sigma_uv_px == NoiseModel().sigma_uv_px
+    noise.learn_uv("object_flow", np.full((100, 2), 0.2))
+    noise.learn_uv("flow", np.full((100, 2), 0.05))
+    own = noise.sigma_uv_px["object_flow"]
+    noise.borrow("object_flow", "flow")
+    assert noise.sigma_uv_px["object_flow"] == own

@@ -65,12 +65,14 @@ def test_masks_get_their_features_on_top_at_the_density_of_the_rest(seed):
     for _ in range(6):
         x, y = rng.integers(20, W - 120), rng.integers(20, H - 90)
         static[y : y + 70, x : x + 100] = False
-    features = OrbExtractor(CONFIG).extract(textured(seed), static)
+    features = OrbExtractor(CONFIG).extract(textured(seed), static, movable_too=True)
     x, y = np.rint(features.uv_px).astype(int).T
     n_static, n_masked = static[y, x].sum(), (~static[y, x]).sum()
     assert 0.95 * CONFIG.n_features < n_static < 1.02 * CONFIG.n_features
     density_ratio = n_masked / (~static).sum() * static.sum() / n_static
     assert 0.95 < density_ratio < 1.05
+    alone = OrbExtractor(CONFIG).extract(textured(seed), static)
+    np.testing.assert_array_equal(alone.uv_px, features.uv_px[static[y, x]])
 
 
 def test_mask_that_hides_nothing_or_all_changes_nothing():
@@ -78,8 +80,9 @@ def test_mask_that_hides_nothing_or_all_changes_nothing():
     without, with_all = (OrbExtractor(CONFIG).extract(gray, mask) for mask in (None, everywhere))
     np.testing.assert_array_equal(without.uv_px, with_all.uv_px)
     np.testing.assert_array_equal(without.descriptors, with_all.descriptors)
-    all_masked = OrbExtractor(CONFIG).extract(gray, ~everywhere)
+    all_masked = OrbExtractor(CONFIG).extract(gray, ~everywhere, movable_too=True)
     np.testing.assert_array_equal(without.uv_px, all_masked.uv_px)
+    assert len(OrbExtractor(CONFIG).extract(gray, ~everywhere)) == 0
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])
