@@ -41,6 +41,8 @@ from pipelines.types import (
     TrackingStatus,
 )
 
+_LANDMARK_MARGIN = 0.2  # features and pixels lie off objects in shares that differ by less
+
 
 class DyObSlam:
     """Dynamic-object SLAM of one camera, frame by frame.
@@ -120,7 +122,10 @@ class DyObSlam:
             flow_px = self._flow.compute(frame)
         # 3. ORB features
         with timed(spent, "features"):
-            prepared = prepare_frame(self.camera, frame, depth_m, self._orb, detections)
+            movable_below = self.config.objects.landmarks_below + _LANDMARK_MARGIN
+            prepared = prepare_frame(
+                self.camera, frame, depth_m, self._orb, detections, movable_below
+            )
         return replace(
             prepared,
             flow_prev_to_curr_px=flow_px,

@@ -68,8 +68,8 @@ class ObjectEstimates:
     boxes_px: (M, 4) x1 y1 x2 y2, first and last pixel columns and rows; NaN where not seen.
     n_points: (M,) int64, points that agree with the motion.
     Ts_world_object: (M, 4, 4), L of the design: begins with the world's axes at the centre of the
-        object's points, and then moves with it; when it is first seen to move its x axis is laid
-        along the motion; NaN where unknown.
+        object's points, and then moves with it; its x axis lies along its motion where it moves
+        from the start; NaN where unknown.
     Hs_world_curr_prev: (M, 4, 4), p_world_curr = H @ p_world_prev for matter of the object, since
         the frame before; NaN where there is none.
     motion_covariances: (M, 6, 6) of [omega rad, v m], a left perturbation of H about the object's

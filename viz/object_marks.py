@@ -147,7 +147,8 @@ def place_labels(
         width = style.text_size(text, size_px, 600 if moves else 400)[0]
         size = (width + round(0.7 * size_px) + (0 if moves else 3), round(1.35 * size_px))
         own = _whole(boxes[row])
-        if not moves and state is not ObjectState.COASTING and own[3] - own[1] < size[1]:
+        least = size[1] * (2 if state is ObjectState.UNKNOWN else 1)
+        if not moves and state is not ObjectState.COASTING and own[3] - own[1] < least:
             continue  # a parked car far away: its label would hide more than it tells
         others = [box for box in movers if box != own]
         taken = [label.box for label in placed]

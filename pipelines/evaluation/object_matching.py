@@ -55,11 +55,14 @@ def match_objects(
     truth: ObjectTruth,
     is_judged: NDArray[np.bool_],
     min_overlap: float,
+    min_area_px: float = 0.0,
 ) -> ObjectMatches:
     """Match the estimates that are seen (not coasting) with the truth rows that are judged.
 
     A true object keeps its estimate of before while they overlap enough (CLEAR MOT, Bernardin and
     Stiefelhagen 2008); the rest are assigned for the greatest sum of overlaps (Hungarian).
+    Estimates that match nothing are ignored where the truth is not judged, and where their box has
+    less than `min_area_px`.
     """
     truth_row = np.full(len(estimates), -1, np.int64)
     overlap = np.zeros(len(estimates))
@@ -78,7 +81,8 @@ def match_objects(
             last[int(true_ids[j])] = int(ids[i])
         small = truth.boxes_px[true_rows[~is_judged[true_rows]]]
         over_small = (box_overlaps(estimates.boxes_px[rows], small) >= min_overlap).any(1)
-        is_ignored[rows] = over_small & (truth_row[rows] < 0)
+        tiny = box_areas_px(estimates.boxes_px[rows]) < min_area_px
+        is_ignored[rows] = (over_small | tiny) & (truth_row[rows] < 0)
     all_pairs = np.concatenate(pairs) if pairs else np.empty((0, 2), np.int64)
     return ObjectMatches(truth_row, overlap, is_ignored, all_pairs)
 

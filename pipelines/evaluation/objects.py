@@ -44,7 +44,9 @@ def evaluate_objects(
     """
     truth = truth[np.isin(truth.frame_index, frames.index)]
     steps = true_steps(truth, frames, limits)
-    matches = match_objects(estimates, truth, steps.is_judged, limits.min_overlap)
+    matches = match_objects(
+        estimates, truth, steps.is_judged, limits.min_overlap, limits.min_pixels
+    )
     says_moving = estimates.state == str(ObjectState.MOVING)
     says_moving &= np.isfinite(estimates.Hs_world_curr_prev).all((1, 2))
     row = matches.truth_row

@@ -18,7 +18,6 @@ from pipelines.frontend.sampling import sample_disparity
 from pipelines.object_types import Detections
 from pipelines.types import Array, Features, Frame, Image, StereoCamera
 
-_MOSTLY_STATIC = 0.6  # share of an image off movable objects, which is landmarks enough
 _CONTRAST_WINDOW_PX = 31  # neighbourhood that the corner detector's contrast is measured against
 _CONTRAST_GAIN = np.float32(40.0)  # grey levels of standard deviation afterwards
 _CONTRAST_FLOOR = 10.0  # grey levels of standard deviation below which contrast is noise
@@ -126,8 +125,13 @@ def prepare_frame(
     depth_m: NDArray[np.float32] | None,
     orb: OrbExtractor,
     detections: Detections | None = None,
+    movable_below: float = 0.0,
 ) -> PreparedFrame:
-    """Grey image, disparities and features of a frame with depth (H, W) in m."""
+    """Grey image, disparities and features of a frame with depth (H, W) in m.
+
+    movable_below: static share of the image below which movable things get features as well, as
+    what stands still may then have to serve as a landmark.
+    """
     gray = to_gray(frame.image)
     if depth_m is None:
         disparity = np.full(gray.shape, np.nan, np.float32)
@@ -137,8 +141,7 @@ def prepare_frame(
         disparity = disparity.astype(np.float32, copy=False)
     labels = None if detections is None else detections.labels
     static = static_pixels(labels, gray.shape, orb.config.mask_dilation_px)
-    # Where little else is in view, what stands still may have to serve as a landmark
-    movable_too = float(static.mean()) < _MOSTLY_STATIC
+    movable_too = float(static.mean()) < movable_below
     features = orb.extract(normalise_contrast(gray), static, movable_too)
     return PreparedFrame(frame, gray, disparity, features, detections)
 

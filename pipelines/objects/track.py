@@ -47,8 +47,7 @@ class ObjectTrack:
     missed_s: for how long detections have gone without it; unconfirmed_s: the same, frames without
     any detections counted. still_since_s: None unless stopped. box_px, area_px, color: of its last
     mask. low_m, high_m: (3,) box around its points in the axes of its pose, NaN where that is not
-    known; extent_m: (3,) its size, also after that. is_oriented: whether its x axis was laid along
-    its motion.
+    known; extent_m: (3,) its size, also after that.
     """
 
     object_id: int
@@ -67,7 +66,6 @@ class ObjectTrack:
     still_since_s: float | None = None
     box_px: Array = field(default_factory=lambda: np.full(4, np.nan))
     area_px: int = 0
-    is_oriented: bool = False
     color: Array = field(default_factory=lambda: np.zeros(64))
     low_m: Array = field(default_factory=lambda: np.full(3, np.nan))
     high_m: Array = field(default_factory=lambda: np.full(3, np.nan))
@@ -240,13 +238,12 @@ class ObjectTrack:
         self.state = state
 
     def orient(self) -> None:
-        """Turn the pose's x axis along the velocity, once: a box along a car's sides is its own.
+        """Turn the pose's x axis along the velocity: a box along a car's sides is its own.
 
         Of a box across them the middle of what is seen lies off the middle of the car.
         """
-        if self.is_oriented or self.filter is None or self.T_world_object is None:
+        if self.filter is None or self.T_world_object is None:
             return
-        self.is_oriented = True
         forward = self.filter.velocity_mps * (1.0, 0.0, 1.0)  # level: the world's y points down
         length = float(np.linalg.norm(forward))
         if length < _LEAST_SPEED_MPS:

@@ -360,6 +360,7 @@ class ObjectTracker:
         way_m = displacement(H, center_prev)
         center = center_prev + way_m
         std_mps = direction_std(way_m, covariance[3:, 3:]) / dt_s
+        is_first = not track.has_motion
         track.take_motion(H, covariance, center, dt_s)
         if self.config.motion_rule == "scene_flow":
             state = decide_by_scene_flow(
@@ -368,7 +369,7 @@ class ObjectTracker:
         else:
             state = self._state_by_speed(track, covariance, spread_m, std_mps, dt_s)
         track.set_state(state, view.timestamp_s)
-        if state is ObjectState.MOVING:
+        if is_first and state is ObjectState.MOVING:
             track.orient()
         score = frame.scores[track.object_id]
         depth_m = float(np.median(points.position_m[:, 2]))

@@ -183,7 +183,7 @@ def test_a_hundred_objects_keep_their_ids(street, board_frames) -> None:
         np.testing.assert_array_equal(result.object_labels, first)
         np.testing.assert_array_equal(result.objects.object_id, np.arange(1, 101))
     assert not (rows_of(results).state == str(ObjectState.MOVING)).any()
-    assert (results[-1].objects.state == str(ObjectState.STOPPED)).sum() > 30
+    assert (results[-1].objects.state == str(ObjectState.STOPPED)).sum() > 15
     assert_sane(results)
 
 
@@ -247,8 +247,8 @@ def test_a_frame_that_is_left_out_doubles_the_step(street, board_frames) -> None
     assert {tuple(r.objects.object_id) for r in results} == {(1,)}
     speed = 3 * 8.0 / street.camera.fx / 0.1
     (after,) = [r.objects for r in results if r.frame_index == 6]
-    assert after.speed_mps[0] == pytest.approx(speed, rel=0.05)
-    assert after.Hs_world_curr_prev[0, 0, 3] == pytest.approx(0.2 * speed, rel=0.05)
+    assert after.speed_mps[0] == pytest.approx(speed, rel=0.1)
+    assert after.Hs_world_curr_prev[0, 0, 3] == pytest.approx(0.2 * speed, rel=0.1)
     assert_sane(results)
 
 

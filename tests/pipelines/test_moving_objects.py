@@ -85,7 +85,7 @@ def dropped(street: Sequence) -> list[FrameResult]:
 def assert_motion(found: dict[str, Any], n_least: int) -> None:
     """Motions as exact inputs give them at 497 x 150 pixels, and no false ones."""
     assert found["object_frames"] >= n_least
-    assert 1e-4 < found["motion"]["trans_rmse_m"] < 4e-3
+    assert 1e-4 < found["motion"]["trans_rmse_m"] < 6e-3
     assert 1e-3 < found["motion"]["rot_rmse_deg"] < 0.16
     # The truth is the way of the object's origin, the estimate that of its seen middle
     assert 1e-3 < found["speed"]["error_mean_kmh"] < 0.5
