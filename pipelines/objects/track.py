@@ -102,6 +102,17 @@ class ObjectTrack:
         """Whether a motion of it was ever measured, be it none at all."""
         return self.H_dt_s > 0.0
 
+    @property
+    def surely_moves(self) -> bool:
+        """Whether its filter, taught by a measured motion, has it moving, whatever came last."""
+        if self.filter is None or not self.has_motion:
+            return False
+        speed_mps = float(np.linalg.norm(self.filter.velocity_mps))
+        return (
+            speed_mps - self.config.significance * self.filter.speed_std_mps
+            > self.config.min_speed_mps
+        )
+
     def velocity_at(self, point_m: Array) -> Array:
         """(3,) m/s of the object's matter at a point (3,) in the world, by the filter.
 

@@ -444,7 +444,7 @@ class ObjectTracker:
                 self._see_without_motion(table, view, frame, track, T_world_camera)
             elif t - track.seen_s > self.config.max_age_s or track.filter is None:
                 del self.tracks[object_id]
-            elif track.state in (ObjectState.MOVING, ObjectState.COASTING):
+            elif track.state in (ObjectState.MOVING, ObjectState.COASTING) or track.surely_moves:
                 track.set_state(ObjectState.COASTING, t)
                 table.add(track, np.nan, center_m=track.filter.center_m, box_px=np.full(4, np.nan))
 
