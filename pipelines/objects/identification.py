@@ -80,7 +80,9 @@ def _distances(tracks: Mapping[int, ObjectTrack], centers_m: Array) -> tuple[Arr
         if track.filter is None:
             continue
         noise = track.center_sigma_m**2 * np.eye(3)
-        distance2[j, known], log_spread[j] = track.filter.distances2(centers_m[known], noise)
+        distance2[j, known], log_spread[j] = track.filter.distances2(
+            centers_m[known], noise, track.middle_offset_m
+        )
     return distance2, log_spread
 
 

@@ -67,17 +67,31 @@ def describe_instances(
             continue
         rows, columns = window
         boxes[m] = columns.start, rows.start, columns.stop - 1, rows.stop - 1
-        v, u = _some_pixels(labels, m + 1, window)
+        v, u = some_pixels(labels, m + 1, window)
         colors[m] = _color_histogram(image[v, u])
-        disparity = disparity_px[v, u]
-        known = disparity > 0
-        if known.any():
-            uv = np.array([[middle_of(u), middle_of(v)]], float)
-            z = camera.bf / np.array([middle_of(disparity[known])], float)
-            centers[m] = backproject(camera, uv, z)[0]
+        centers[m] = middle_of_pixels(camera, disparity_px, v, u)
     return Instances(
         labels, windows, boxes, centers, colors, detections.class_names, detections.scores
     )
+
+
+def middle_of_pixels(
+    camera: StereoCamera,
+    disparity_px: NDArray[np.float32],
+    v: NDArray[np.int64],
+    u: NDArray[np.int64],
+    min_disparity_px: float = 0.0,
+) -> Array:
+    """(3,) in the camera: the middle of pixels (rows v, columns u), at their median depth.
+
+    NaN where no pixel has a disparity of more than `min_disparity_px`.
+    """
+    disparity = disparity_px[v, u]
+    known = disparity > min_disparity_px
+    if not known.any():
+        return np.full(3, np.nan)
+    z = camera.bf / np.array([middle_of(disparity[known])], float)
+    return backproject(camera, np.array([[middle_of(u), middle_of(v)]], float), z)[0]
 
 
 def middle_of(values: NDArray[Any]) -> Any:
@@ -86,7 +100,7 @@ def middle_of(values: NDArray[Any]) -> Any:
     return np.partition(values, half)[half]
 
 
-def _some_pixels(
+def some_pixels(
     labels: NDArray[np.int32], label: int, window: Window
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns (N,) of about `_SAMPLES` pixels of a label, evenly spread; one at least."""

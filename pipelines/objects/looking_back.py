@@ -65,7 +65,7 @@ def guess_motions(
     guesses: dict[int, Array] = {}
     for object_id in frame.windows:
         before = last.mask(object_id)
-        if object_id in solved or before is None or frame.scores[object_id] == 0.0:
+        if object_id in solved or before is None or object_id in frame.carried_ids:
             continue
         mask = frame.mask(object_id)
         if min(np.count_nonzero(before[0]), np.count_nonzero(mask)) < _MIN_SEARCH_PX:

@@ -17,7 +17,12 @@ from pipelines.object_types import UNNAMED_CLASS, Detections, ObjectEstimates, O
 from pipelines.objects.following import Followed, follow_points
 from pipelines.objects.frame import LastObjects, ObjectFrame
 from pipelines.objects.identification import carry_missed, identify
-from pipelines.objects.instances import Instances, describe_instances
+from pipelines.objects.instances import (
+    Instances,
+    describe_instances,
+    middle_of_pixels,
+    some_pixels,
+)
 from pipelines.objects.kalman import direction_std
 from pipelines.objects.looking_back import guess_motions, seed_pixels
 from pipelines.objects.motion import (
@@ -73,8 +78,7 @@ class ObjectTracker:
             return ObjectFrame(seen.labels, detections is not None, *nothing, False)
         dt_s = self._time_since_last(view)
         for track in self.tracks.values():
-            if track.filter is not None:
-                track.filter.predict(dt_s)
+            track.predict(dt_s)
         last_points = ObjectPoints.empty() if self._last is None else self._last.points
         followed = self._follow(view, last_points, T_predicted)
         answered = detections is not None
@@ -115,6 +119,7 @@ class ObjectTracker:
         again = identify(lost, instances, frame.points, frame.followed, T_world_camera)
         found |= {i: m for i, m in again.items() if labels[m] not in frame.windows}
         frame.windows, frame.new_ids = {}, [i for i in frame.new_ids if i in found]
+        frame.carried_ids &= set(found)
         scores, frame.scores = frame.scores, {}
         painted = self._paint(frame, instances, found, scores)
         self._keep_points_in_sight(frame)
@@ -151,6 +156,7 @@ class ObjectTracker:
                 nameless = str(instances.class_names[m]) == UNNAMED_CLASS
                 score = score if nameless else scores[object_id]
                 if nameless:  # geometry drops what it does not see
+                    frame.carried_ids.discard(object_id)
                     self.tracks[object_id].unconfirmed_s = 0.0
             else:
                 self.tracks[object_id].take_detection(
@@ -171,6 +177,7 @@ class ObjectTracker:
         window = carry_missed(self.config, track, self._last, frame.followed, frame.labels)
         if window is not None:
             frame.windows[object_id], frame.scores[object_id] = window, 0.0
+            frame.carried_ids.add(object_id)
 
     def _keep_points_in_sight(self, frame: ObjectFrame) -> None:
         """Drop the points that are lost, behind another object, or of an object out of sight."""
@@ -431,7 +438,7 @@ class ObjectTracker:
         """Objects without a motion in this frame: in sight, coasting, or to be forgotten."""
         t, dt_s = view.timestamp_s, self._time_since_last(view)
         for object_id, track in list(self.tracks.items()):
-            carried = frame.scores.get(object_id) == 0.0
+            carried = object_id in frame.carried_ids
             if carried and frame.answered and object_id not in measured_ids:
                 frame.remove(object_id)  # no detection and no motion bears it out
             in_sight = object_id in frame.windows
@@ -446,7 +453,8 @@ class ObjectTracker:
                 del self.tracks[object_id]
             elif track.state in (ObjectState.MOVING, ObjectState.COASTING) or track.surely_moves:
                 track.set_state(ObjectState.COASTING, t)
-                table.add(track, np.nan, center_m=track.filter.center_m, box_px=np.full(4, np.nan))
+                center = track.filter.center_m + track.middle_offset_m
+                table.add(track, np.nan, center_m=center, box_px=np.full(4, np.nan))
 
     def _see_without_motion(
         self,
@@ -457,17 +465,14 @@ class ObjectTracker:
         T_world_camera: Array,
     ) -> None:
         """Too small, too far, or too uncertain: where it is may still be known."""
-        rows, columns = frame.windows[track.object_id]
-        v, u = np.nonzero(frame.mask(track.object_id))
-        uv = np.array([[np.median(u) + columns.start, np.median(v) + rows.start]])
-        disparity = view.disparity_px[v + rows.start, u + columns.start]
-        disparity = disparity[disparity >= self.sensor.min_disparity_px]
-        center = np.full(3, np.nan)
-        if len(disparity):
-            z = self.camera.bf / np.array([np.median(disparity)], float)
-            center = transform_points(T_world_camera, backproject(self.camera, uv, z))[0]
-            if len(v) >= _MOSTLY_SEEN * track.area_px:  # else something is passing before it
-                track.take_center(center)
+        v, u = some_pixels(frame.labels, track.object_id, frame.windows[track.object_id])
+        center = middle_of_pixels(
+            self.camera, view.disparity_px, v, u, self.sensor.min_disparity_px
+        )
+        center = transform_points(T_world_camera, center[None])[0]
+        n_pixels = np.count_nonzero(frame.mask(track.object_id))
+        if np.isfinite(center).all() and n_pixels >= _MOSTLY_SEEN * track.area_px:
+            track.take_center(center)  # else something is passing before it
         if track.state is not ObjectState.STOPPED or not track.is_anchored:
             track.set_state(ObjectState.UNKNOWN, view.timestamp_s)
         table.add(track, frame.scores[track.object_id], center_m=center)

@@ -171,7 +171,9 @@ def test_stretched_time_stamps_halve_the_speeds(street, exact) -> None:
     n_compared = 0
     for one, other in zip(exact, process(street, (), stretched), strict=True):
         for i in np.flatnonzero((one.objects.state == MOVING) & (one.objects.speed_mps > 2.0)):
-            (j,) = np.flatnonzero(other.objects.object_id == one.objects.object_id[i])
+            mask = one.object_labels == one.objects.object_id[i]
+            its_id = np.bincount(other.object_labels[mask]).argmax()  # specks shift the numbers
+            (j,) = np.flatnonzero(other.objects.object_id == its_id)
             speed, halved = one.objects.speed_mps[i], other.objects.speed_mps[j]
             assert halved == pytest.approx(0.5 * speed, rel=0.005)
             n_compared += 1
