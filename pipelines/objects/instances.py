@@ -31,7 +31,8 @@ class Instances:
     labels: (H, W) int32, 0 = background, n = row n - 1. windows: where each lies, None where it has
     no pixel. boxes_px: (M, 4) first and last columns and rows, NaN without pixels.
     centers_m: (M, 3) in the camera, at the median depth; NaN where no depth is known.
-    colors: (M, 64) histograms that sum to 1. class_names: (M,). scores: (M,).
+    colors: (M, 64) histograms that sum to 1, of n_colored: (M,) pixels. class_names: (M,).
+    scores: (M,).
     """
 
     labels: NDArray[np.int32]
@@ -39,6 +40,7 @@ class Instances:
     boxes_px: Array
     centers_m: Array
     colors: Array
+    n_colored: NDArray[np.int64]
     class_names: NDArray[np.str_]
     scores: Array
 
@@ -61,17 +63,24 @@ def describe_instances(
     windows = find_objects(labels, max_label=M) if M else []
     boxes = np.full((M, 4), np.nan)
     centers = np.full((M, 3), np.nan)
-    colors = np.zeros((M, _BINS**3))
+    colors, n_colored = np.zeros((M, _BINS**3)), np.zeros(M, np.int64)
     for m, window in enumerate(windows):
         if window is None:
             continue
         rows, columns = window
         boxes[m] = columns.start, rows.start, columns.stop - 1, rows.stop - 1
         v, u = some_pixels(labels, m + 1, window)
-        colors[m] = _color_histogram(image[v, u])
+        colors[m], n_colored[m] = _color_histogram(image[v, u]), len(v)
         centers[m] = middle_of_pixels(camera, disparity_px, v, u)
     return Instances(
-        labels, windows, boxes, centers, colors, detections.class_names, detections.scores
+        labels,
+        windows,
+        boxes,
+        centers,
+        colors,
+        n_colored,
+        detections.class_names,
+        detections.scores,
     )
 
 
