@@ -32,6 +32,7 @@ _GROWTH = 0.6  # of the way to them by which the box grows in a frame, for the s
 _SEEN_SIGMA_M = 1.0  # the middle of a mask, at its median depth
 _PART_SHARE = 0.35  # of its size, the same where a part of it may be hidden
 _LARGEST_PART_M = 1.75  # of anything: four of it are half of a bus; far boxes are too long
+_MIDDLE_SHARE, _LARGEST_OFF_M = 0.12, 0.6  # of its size, how far its seen middle is off its own
 _SHRINKING = 0.98  # share of its size that it keeps from frame to frame at least
 _LEAST_SPEED_MPS = 0.1  # m/s over ground, of a velocity that has a direction
 _MAX_SLIP_S = 0.5  # s without a measured motion after which nobody knows where its box is
@@ -131,7 +132,17 @@ class ObjectTrack:
         """Standard deviation along the filter's velocity, NaN where that is not told."""
         if self.filter is None or not self.has_motion:
             return np.nan
-        return self.filter.speed_std_mps
+        turn_radps = float(np.linalg.norm(self.filter.turn_radps))
+        return float(np.hypot(self.filter.speed_std_mps, self.middle_doubt_mps(turn_radps)))
+
+    def middle_doubt_mps(self, turn_radps: float) -> float:
+        """Standard deviation of its speed by not knowing where its middle is, while it turns.
+
+        Only sides of it are seen, so that the middle of what is seen lies off its own; where it
+        turns, each place of it has another speed. This error is the same in frame after frame.
+        """
+        size_m = float(np.nan_to_num(self.extent_m).max())
+        return turn_radps * min(_MIDDLE_SHARE * size_m, _LARGEST_OFF_M)
 
     def is_landmark(self, timestamp_s: float) -> bool:
         """Whether it has been still for so long that it serves the camera as the world does."""

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from pipelines.config import ObjectsConfig
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
-from pipelines.geometry import MIN_DEPTH_M, backproject, invert_T, project_stereo, transform_points
+from pipelines.geometry import (
+    MIN_DEPTH_M,
+    backproject,
+    invert_T,
+    project_stereo,
+    rotation_vector,
+    transform_points,
+)
 from pipelines.object_types import UNNAMED_CLASS, Detections, ObjectEstimates, ObjectState
 from pipelines.objects.following import Followed, follow_points
 from pipelines.objects.frame import LastObjects, ObjectFrame
@@ -378,6 +385,8 @@ class ObjectTracker:
         track.set_state(state, view.timestamp_s)
         if is_first and state is ObjectState.MOVING:
             track.orient()
+        turn_std = largest_std(covariance[:3, :3])
+        sure_turn = max(0.0, float(np.linalg.norm(rotation_vector(H))) - turn_std) / dt_s
         score = frame.scores[track.object_id]
         depth_m = float(np.median(points.position_m[:, 2]))
         if 0.0 < self.config.max_depth_m < depth_m:
@@ -391,7 +400,7 @@ class ObjectTracker:
             motion_covariance=covariance,
             center_m=center,
             speed_mps=float(np.linalg.norm(way_m)) / dt_s,  # eq. (6)
-            speed_std_mps=std_mps,
+            speed_std_mps=float(np.hypot(std_mps, track.middle_doubt_mps(sure_turn))),
         )
         return True
 
