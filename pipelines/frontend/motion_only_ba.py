@@ -158,8 +158,13 @@ def _residual_covariance(
     camera: StereoCamera, points_camera: Array, R: Array, observations: StereoObservations
 ) -> Array:
     """The same from points (N, 3) in the camera and rotations (3, 3) or (N, 3, 3) to it."""
-    J = projection_jacobian(camera, points_camera) @ np.swapaxes(R, -1, -2)
-    S = J @ observations.point_covariances_m2 @ J.transpose(0, 2, 1)
+    J = projection_jacobian(camera, points_camera)
+    if R.ndim == 2:  # one product, not N of them
+        J = (J.reshape(-1, 3) @ R.T).reshape(-1, 3, 3)
+    else:
+        J = J @ np.ascontiguousarray(np.swapaxes(R, -1, -2))
+    # Rows in a row: products of transposed views take twice the time
+    S = J @ observations.point_covariances_m2 @ np.ascontiguousarray(J.transpose(0, 2, 1))
     return add_pixel_noise(S, observations)
 
 
