@@ -17,7 +17,7 @@ from pipelines.object_types import UNNAMED_CLASS, Detections, ObjectEstimates, O
 from pipelines.objects.following import Followed, follow_points
 from pipelines.objects.frame import LastObjects, ObjectFrame
 from pipelines.objects.identification import carry_missed, identify
-from pipelines.objects.instances import Instances, describe_instances
+from pipelines.objects.instances import Instances, describe_instances, relabelled
 from pipelines.objects.looking_back import guess_motions, seed_pixels
 from pipelines.objects.motion import move_points
 from pipelines.objects.motion_intake import MotionIntake
@@ -144,7 +144,7 @@ class ObjectTracker:
                     str(instances.class_names[m]), score, instances.colors[m]
                 )
             frame.windows[object_id], frame.scores[object_id] = window, score
-        frame.labels = table[instances.labels]
+        frame.labels = relabelled(instances.labels, table)
         return [int(i) for i in table[1:]]
 
     def _carry(self, frame: ObjectFrame, object_id: int, dt_s: float) -> None:
