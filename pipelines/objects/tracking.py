@@ -14,10 +14,8 @@ from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
 from pipelines.geometry import (
     MIN_DEPTH_M,
-    backproject,
     invert_T,
     project_stereo,
-    rotation_vector,
     transform_points,
 )
 from pipelines.object_types import UNNAMED_CLASS, Detections, ObjectEstimates, ObjectState
@@ -28,30 +26,18 @@ from pipelines.objects.instances import (
     Instances,
     describe_instances,
     middle_of_pixels,
+    relabelled,
     some_pixels,
 )
-from pipelines.objects.kalman import direction_std
 from pipelines.objects.looking_back import guess_motions, seed_pixels
-from pipelines.objects.motion import (
-    GATE_6DOF,
-    displacement,
-    fuse_motions,
-    largest_std,
-    motion_in_world,
-    move_points,
-    points_std,
-    world_covariance,
-)
-from pipelines.objects.motion_state import decide_by_scene_flow, decide_by_speed
+from pipelines.objects.motion import move_points
+from pipelines.objects.motion_intake import MotionIntake
 from pipelines.objects.points import ObjectPoints, choose_pixels, points_wanted
 from pipelines.objects.rows import RowTable
 from pipelines.objects.solver import MotionSolver, Solution
 from pipelines.objects.track import ObjectTrack
-from pipelines.observations import StereoObservations
 from pipelines.types import Array
 
-_SURE_SHARE = 0.6  # of the points that must agree with a motion that nobody expected
-_LASTING_SHARE = 0.5  # of a speed's error stays from frame to frame, as its points do
 _MOSTLY_SEEN = 0.6  # of its last mask, below which a mask does not say where an object is
 _ENOUGH = 0.8  # of the points wanted on an object, above which no new ones are taken
 _SURE_SPEED_MPS = 1.0  # m/s, standard deviation of a speed by which points may be expected
@@ -170,7 +156,7 @@ class ObjectTracker:
                     str(instances.class_names[m]), score, instances.colors[m]
                 )
             frame.windows[object_id], frame.scores[object_id] = window, score
-        frame.labels = table[instances.labels]
+        frame.labels = relabelled(instances.labels, table)
         return [int(i) for i in table[1:]]
 
     def _carry(self, frame: ObjectFrame, object_id: int, dt_s: float) -> None:
@@ -268,12 +254,11 @@ class ObjectTracker:
         is_tracked = bool(np.isfinite(pose_covariance).all())
         measured_ids: set[int] = set()
         if is_tracked and self._last is not None and self._last.is_tracked:
+            intake = MotionIntake(
+                self.camera, self.config, self._last, view, T_world_camera, pose_covariance
+            )
             for solution in solutions:
-                for j in np.flatnonzero(solution.accepted):
-                    if self._take_motion(
-                        table, view, frame, solution, int(j), T_world_camera, pose_covariance
-                    ):
-                        measured_ids.add(int(solution.motions.object_id[j]))
+                measured_ids.update(intake.take(solution, self.tracks, frame, table))
         self._take_rest(table, view, frame, measured_ids, T_world_camera)
         moved = [self._solver.refine(solution) for solution in solutions]
         points = self._renew_points(view, frame, T_world_camera, ObjectPoints.concatenate(*moved))
@@ -335,104 +320,6 @@ class ObjectTracker:
             ObjectPoints.concatenate(frame.points, seeds),
             Followed.concatenate(frame.followed, followed)[np.argsort(owners, kind="stable")],
         )
-
-    def _take_motion(
-        self,
-        table: RowTable,
-        view: View,
-        frame: ObjectFrame,
-        solution: Solution,
-        j: int,
-        T_world_camera: Array,
-        pose_covariance: Array,
-    ) -> bool:
-        """A solved motion into the object's filter, pose and state; False if too uncertain."""
-        assert self._last is not None
-        dt_s = self._time_since_last(view)
-        motions, rows = solution.motions, solution.rows_of(j)
-        good = motions.inliers[rows]
-        points, observations = solution.points[rows][good], solution.observations[rows][good]
-        track = self.tracks[int(motions.object_id[j])]
-        H = motion_in_world(motions.Gs_curr_prev[j], T_world_camera, self._last.T_world_camera)
-        center_prev = track.box_center_m
-        if center_prev is None:
-            center_prev = transform_points(self._last.T_world_camera, points.position_m).mean(0)
-        covariance = world_covariance(
-            motions.covariances[j] + pose_covariance,
-            T_world_camera,
-            center_prev + displacement(H, center_prev),
-        )
-        fused = fuse_motions(*track.expected_motion(center_prev, dt_s), H, covariance, center_prev)
-        if fused.distance2 > GATE_6DOF:
-            sure = good.mean() >= _SURE_SHARE and good.sum() >= 2 * self.config.min_points
-            if track.H_world_curr_prev is None or not sure:
-                return False  # nothing moves like this, or hardly any point says so
-        H, covariance = fused.H_world_curr_prev, fused.covariance
-        spread_m = float(np.sqrt(points.position_m.var(0).sum()))
-        if not self._is_certain(covariance, spread_m, dt_s):
-            return False
-        way_m = displacement(H, center_prev)
-        center = center_prev + way_m
-        std_mps = direction_std(way_m, covariance[3:, 3:]) / dt_s
-        is_first = not track.has_motion
-        track.take_motion(H, covariance, center, dt_s)
-        if self.config.motion_rule == "scene_flow":
-            state = decide_by_scene_flow(
-                self.config, self._scene_flow(points, observations, T_world_camera)
-            )
-        else:
-            state = self._state_by_speed(track, covariance, spread_m, std_mps, dt_s)
-        track.set_state(state, view.timestamp_s)
-        if is_first and state is ObjectState.MOVING:
-            track.orient()
-        turn_std = largest_std(covariance[:3, :3])
-        sure_turn = max(0.0, float(np.linalg.norm(rotation_vector(H))) - turn_std) / dt_s
-        score = frame.scores[track.object_id]
-        depth_m = float(np.median(points.position_m[:, 2]))
-        if 0.0 < self.config.max_depth_m < depth_m:
-            table.add(track, score, center_m=center, state=ObjectState.UNKNOWN)
-            return True
-        table.add(
-            track,
-            score,
-            n_points=int(motions.n_inliers[j]),
-            H_world_curr_prev=H,
-            motion_covariance=covariance,
-            center_m=center,
-            speed_mps=float(np.linalg.norm(way_m)) / dt_s,  # eq. (6)
-            speed_std_mps=float(np.hypot(std_mps, track.middle_doubt_mps(sure_turn))),
-        )
-        return True
-
-    def _is_certain(self, covariance: Array, spread_m: float, dt_s: float) -> bool:
-        """Whether a motion with a covariance (6, 6) is worth telling; no wild estimates go out."""
-        if largest_std(covariance[:3, :3]) > np.radians(self.config.max_turn_std_deg):
-            return False
-        return points_std(covariance, spread_m) <= self.config.max_speed_std_mps * dt_s
-
-    def _state_by_speed(
-        self, track: ObjectTrack, covariance: Array, spread_m: float, std_mps: float, dt_s: float
-    ) -> ObjectState:
-        """State by the speed of the object's points: of its centre, and of its sure turning."""
-        assert track.filter is not None
-        turn_std = largest_std(covariance[:3, :3]) / dt_s
-        turn = float(np.linalg.norm(track.filter.turn_radps))
-        sure_turn = max(0.0, turn - self.config.significance * turn_std)
-        speed = float(np.linalg.norm(track.filter.velocity_mps)) + sure_turn * spread_m
-        std = float(np.hypot(track.filter.speed_std_mps, _LASTING_SHARE * std_mps))
-        return decide_by_speed(self.config, track.state, speed, std)
-
-    def _scene_flow(
-        self, points: ObjectPoints, observations: StereoObservations, T_world_camera: Array
-    ) -> Array:
-        """f = X_k p_k - X_k-1 p_k-1 (N, 3) in m, of the points whose depth is measured now."""
-        assert self._last is not None
-        uvr = observations.uvr_px
-        z = self.camera.bf / (uvr[:, 0] - uvr[:, 2])
-        known = np.isfinite(z)
-        now = backproject(self.camera, uvr[known, :2], z[known])
-        before = transform_points(self._last.T_world_camera, points.position_m[known])
-        return transform_points(T_world_camera, now) - before
 
     # ------------------------------------------------------------------ rest
 
