@@ -127,14 +127,15 @@ def _make(name: str, weights: Path, output: Path, unchecked: bool) -> None:
 
 
 def _train_vocabulary(arguments: Namespace) -> None:
-    """Learn the words of images, and write them; the output's name is looked at beforehand."""
+    """Learn the words of images, and write them."""
     from pipelines.backend.training_images import descriptors_of, images_of, own_images
     from pipelines.backend.vocabulary_files import check_name, save_vocabulary
-    from pipelines.backend.vocabulary_training import train_vocabulary
+    from pipelines.backend.vocabulary_training import check_tree, train_vocabulary
     from pipelines.config import OrbConfig
 
     output = Path(arguments.output).expanduser()
-    check_name(output)
+    check_name(output)  # minutes before it is needed
+    check_tree(arguments.branching, arguments.depth)
     descriptors = []
     for source in arguments.images or [None]:
         with console.working(f"finding ORB features in {source or 'images made here'}"):

@@ -119,7 +119,10 @@ def _load_text(path: Path) -> Vocabulary:
 
 
 def _load_yaml(path: Path) -> Vocabulary:
-    """The yml of DBoW2 and DBoW3, read by patterns, as a general reader takes minutes for it."""
+    """The yml of DBoW2 and DBoW3, as OpenCV writes it.
+
+    Read by patterns: OpenCV's own reader counts from the first node on to get at each one.
+    """
     text = _read_text(path)
     nodes = _NODE.findall(text)
     if not nodes:

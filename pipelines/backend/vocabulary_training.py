@@ -34,15 +34,11 @@ def train_vocabulary(
     bits (Grana et al., A fast approach for integrating ORB descriptors in the bag of words model,
     2013), down to `depth` levels; a node of one descriptor is not parted. A word's weight is
     ln(images / images that have it). The same input and seed give the same bytes.
-    progress: called with (done, total) descriptors of the last level but one.
+    progress: called with (done, total) descriptors parted on the last level.
     Raises ConfigError for a tree that cannot be, DyObError where there are too few images or
     descriptors to tell words apart.
     """
-    if branching < 2 or depth < 1:
-        raise ConfigError(
-            f"a vocabulary needs a branching of 2 or more and a depth of 1 or more, found "
-            f"{branching} and {depth}"
-        )
+    check_tree(branching, depth)
     descriptors = np.concatenate(images) if images else np.empty((0, 32), np.uint8)
     if len(images) < 2 or len(descriptors) < branching:
         raise DyObError(
@@ -71,6 +67,15 @@ def train_vocabulary(
         np.ones(n_children.count(0), np.float32),
     )
     return Vocabulary(tree.centroids, tree.n_children, inverse_document_frequency(tree, images))
+
+
+def check_tree(branching: int, depth: int) -> None:
+    """Raise ConfigError where a tree of such numbers tells nothing apart."""
+    if branching < 2 or depth < 1:
+        raise ConfigError(
+            "a vocabulary needs a branching of 2 or more and a depth of 1 or more, found "
+            f"{branching} and {depth}"
+        )
 
 
 def inverse_document_frequency(
