@@ -90,12 +90,13 @@ datasets vdo""",
     ),
     "models": Verb(
         "app.models:models",
-        "list the networks' files, fetch, add or make them",
+        "list the networks' files, fetch, add or make them; train a vocabulary of places",
         """\
 models                          # which there are, which are at hand, licences
 models fetch mask_rcnn          # download torchvision's weights, and make the file
 models add yolo_seg yolov8n-seg.onnx
-models export mask_rcnn --weights my.pth --unchecked""",
+models export mask_rcnn --weights my.pth --unchecked
+models train-vocabulary IMAGES simulated:room --output my_words.npz""",
     ),
     "test": Verb(
         "app.checks:test",
@@ -299,21 +300,49 @@ def _add_datasets(parser: argparse.ArgumentParser) -> None:
 def _add_models(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(action="list")
     actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions")
-    fetch = actions.add_parser("fetch", help="download a file, checked", allow_abbrev=False)
+    actions.add_parser("fetch", help="download a file, checked", allow_abbrev=False)
     add = actions.add_parser("add", help="copy a file of your own in, checked", allow_abbrev=False)
     export = actions.add_parser(
         "export", help="make an ONNX file from weights (installs torch)", allow_abbrev=False
     )
-    for name, action in (("fetch", fetch), ("add", add), ("export", export)):
+    train = actions.add_parser(
+        "train-vocabulary", help="learn the words that tell places apart", allow_abbrev=False
+    )
+    for name, action in actions.choices.items():
         lines = VERBS["models"].examples.splitlines()
         action.examples = "\n".join(line for line in lines if line.startswith(f"models {name}"))
-        action.add_argument("name", metavar="NAME", help="as `models` lists them")
         action.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        if action is not train:
+            action.add_argument("name", metavar="NAME", help="as `models` lists them")
     add.add_argument("file", metavar="FILE")
     export.add_argument("--weights", metavar="FILE", help="default: the published ones, fetched")
     export.add_argument("--output", metavar="FILE", help="default: where `run` looks for it")
     export.add_argument(
         "--unchecked", action="store_true", help="take weights that are not the published ones"
+    )
+    _add_train_vocabulary(train)
+
+
+def _add_train_vocabulary(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "images",
+        metavar="IMAGES",
+        nargs="*",
+        help="images, folders of images, or sequences as `run` takes them (default: those that "
+        "the shipped vocabulary is made of, which takes minutes)",
+    )
+    parser.add_argument("--output", metavar="FILE", required=True, help="to write, a .npz")
+    parser.add_argument(
+        "--stride", type=_positive, default=1, metavar="S", help="every S-th image of each source"
+    )
+    parser.add_argument(
+        "--branching", type=_positive, default=32, metavar="K", help="children of a node at most"
+    )
+    parser.add_argument(
+        "--depth", type=_positive, default=3, metavar="L", help="levels of the tree"
+    )
+    parser.add_argument(
+        "--seed", type=_not_negative, default=0, metavar="N", help="of the centroids"
     )
 
 

@@ -1,6 +1,7 @@
-"""`models`: which networks' files there are, and the ways in: fetch, add, export.
+"""`models`: which networks' files there are, the ways in, and training of a vocabulary.
 
-Owns what a person is told about them. Files, checksums and downloads are in `pipelines/models.py`.
+Owns what a person is told about them. Files, checksums and downloads are in `pipelines/models.py`,
+vocabularies in `pipelines/backend/`.
 """
 
 from __future__ import annotations
@@ -13,8 +14,15 @@ from pipelines.errors import ModelError
 
 
 def models(arguments: Namespace) -> int:
-    """`models [fetch | add | export]`: 0 when it is done; ModelError says what stood in the way."""
-    actions = {None: _list, "list": _list, "fetch": _fetch, "add": _add, "export": _export}
+    """`models [ACTION]`: 0 when it is done; a DyObError says what stood in the way."""
+    actions = {
+        None: _list,
+        "list": _list,
+        "fetch": _fetch,
+        "add": _add,
+        "export": _export,
+        "train-vocabulary": _train_vocabulary,
+    }
     actions[arguments.action](arguments)
     return 0
 
@@ -116,6 +124,34 @@ def _make(name: str, weights: Path, output: Path, unchecked: bool) -> None:
     into = storing(name) if output == model_path(name) else replacing(output)
     with console.working(f"making {name} from {weights}"), into as fresh:
         export_mask_rcnn(weights, fresh, any_weights=unchecked)
+
+
+def _train_vocabulary(arguments: Namespace) -> None:
+    """Learn the words of images, and write them."""
+    from pipelines.backend.training_images import descriptors_of, images_of, own_images
+    from pipelines.backend.vocabulary_files import check_name, save_vocabulary
+    from pipelines.backend.vocabulary_training import check_tree, train_vocabulary
+    from pipelines.config import OrbConfig
+
+    output = Path(arguments.output).expanduser()
+    check_name(output)  # minutes before it is needed
+    check_tree(arguments.branching, arguments.depth)
+    descriptors = []
+    for source in arguments.images or [None]:
+        with console.working(f"finding ORB features in {source or 'images made here'}"):
+            images = own_images() if source is None else images_of(source, arguments.stride)
+            descriptors += descriptors_of(images, OrbConfig())
+    with console.counting("telling words apart, descriptors") as progress:
+        vocabulary = train_vocabulary(
+            descriptors, arguments.branching, arguments.depth, arguments.seed, progress
+        )
+    save_vocabulary(vocabulary, output)
+    n_descriptors = sum(map(len, descriptors))
+    console.say(
+        f"{output}: {vocabulary.n_words} words of {n_descriptors} descriptors in "
+        f"{len(descriptors)} images, {output.stat().st_size / 1e6:.1f} MB"
+    )
+    console.next_steps({"use it": f"run DATA --set places.vocabulary={output}"})
 
 
 def _say_where(name: str, path: Path) -> None:

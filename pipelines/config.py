@@ -252,6 +252,15 @@ class ObjectsConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class PlacesConfig:
+    """Step 11: recognition of places seen before."""
+
+    # path of a vocabulary: .npz of `models train-vocabulary`, or DBoW2's or DBoW3's .txt, .yml,
+    # .yml.gz; empty = the one that comes with the program
+    vocabulary: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """The whole system's settings."""
 
@@ -263,6 +272,7 @@ class Config:
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
+    places: PlacesConfig = field(default_factory=PlacesConfig)
 
 
 def load_config(path: str | Path | None = None, overrides: Iterable[str] = ()) -> Config:

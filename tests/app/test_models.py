@@ -183,3 +183,43 @@ def test_help_of_each_action_begins_with_examples(action: str, capsys) -> None:
         parse(action, "--help")
     assert left.value.code == 0
     assert capsys.readouterr().out.startswith(f"Examples:\n  python3 -m app models {action} ")
+
+
+def test_train_vocabulary_writes_what_load_reads(tmp_path: Path) -> None:
+    import cv2
+
+    from pipelines.backend.training_images import paint_leaves
+    from pipelines.backend.vocabulary_files import load_vocabulary
+
+    (tmp_path / "photos").mkdir()
+    for seed in range(3):
+        cv2.imwrite(str(tmp_path / f"photos/{seed}.png"), paint_leaves(seed))
+    one = tmp_path / "photos/0.png"
+    files = [tmp_path / "a.npz", tmp_path / "b.npz"]
+    for file in files:
+        words = ("--output", file, "--branching", "5", "--depth", "2", "--seed", "3")
+        done = app("train-vocabulary", tmp_path / "photos", one, *words)
+        assert done.returncode == 0, done.stderr
+        assert f"{file}: 25 words of 6000 descriptors in 4 images, 0.0 MB" in done.stdout
+        assert f"--set places.vocabulary={file}" in done.stdout
+    assert files[0].read_bytes() == files[1].read_bytes()
+    vocabulary = load_vocabulary(files[0])
+    assert (vocabulary.n_words, vocabulary.branching, vocabulary.depth) == (25, 5, 2)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["NOWHERE", "--output", "v.npz"], "NOWHERE: expected the folder of a sequence"),
+        (["NOWHERE", "--output", "v.yml"], "v.yml: expected the name of a vocabulary to end in"),
+        (["NOWHERE"], "required: --output"),
+        (["a.png", "--output", "v.npz", "--depth", "0"], "--depth: expected a whole number of at"),
+        (["a.png", "--output", "v.npz", "--branching", "1"], "a branching of 2 or more"),
+    ],
+)
+def test_train_vocabulary_says_what_is_wrong(words: list[str], said: str) -> None:
+    done = app("train-vocabulary", *words)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
