@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.frame_observations import FrameObservations
 from pipelines.object_types import ObjectEstimates
 from pipelines.shapes import check_shape
 
@@ -233,6 +234,7 @@ class FrameResult:
     reprojection_rmse_px: of the inliers' pixels (u_L, v), NaN where there are none.
     objects: rows of all objects that are being tracked. object_labels: (H, W) int32, pixels of each
         by its lasting id, 0 elsewhere; None where there are no objects.
+    observations: what the batch will want to know of this frame.
     timings_ms: time of each stage of this frame; "total", their sum; in a run also "wall", the time
         since the result before this one, which is less as frames are prepared ahead.
     """
@@ -251,6 +253,7 @@ class FrameResult:
     objects: ObjectEstimates = field(default_factory=ObjectEstimates.empty)
     object_labels: NDArray[np.int32] | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
+    observations: FrameObservations | None = None
 
     def __post_init__(self) -> None:
         N = len(self.keypoints_px)
