@@ -266,7 +266,9 @@ class BatchConfig:
     held_out_share: float = 0.1  # of the sightings, which judge whether the batch is believed
     max_static_per_frame: int = 0  # static points of a frame, the longest tracks first, 0 = all
     covariances: bool = True  # standard deviations of the final poses
-    partial_window: int = 0  # frames of the partial batch (paper: 20), 0 = none
+    # partial: cameras and static points alone, in windows
+    method: Literal["global", "partial"] = "global"
+    partial_window: int = 20  # frames of a window of the partial batch (paper)
     partial_overlap: int = 4  # frames that a window shares with the one before (paper)
 
     def __post_init__(self) -> None:
@@ -274,7 +276,7 @@ class BatchConfig:
         _check(self, acceleration_mps2=(1e-3, _ANY), turn_radps2=(1e-3, _ANY))
         _check(self, planar_sigma=(0, 1), held_out_share=(0.01, 0.5))
         _check(self, max_static_per_frame=(0, _ANY))
-        _check(self, partial_window=(0, 1000), partial_overlap=(1, 1000))
+        _check(self, partial_window=(4, 1000), partial_overlap=(1, 1000))
 
 
 @dataclass(frozen=True, slots=True)

@@ -270,7 +270,7 @@ class StaticMap:
 
     points_m: (N, 3) in the world. colors: (N, 3) uint8 RGB. n_observations: (N,) int32, frames
     that found the point. keyframe_Ts_world_camera: (K, 4, 4). keyframe_indices: (K,) int64 frame
-    indices.
+    indices. track_ids: (N,) int64, the points' lasting numbers in the observation log, or None.
     """
 
     points_m: Array
@@ -278,9 +278,12 @@ class StaticMap:
     n_observations: NDArray[np.int32]
     keyframe_Ts_world_camera: Array
     keyframe_indices: NDArray[np.int64]
+    track_ids: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         N, K = len(self.points_m), len(self.keyframe_indices)
+        if self.track_ids is not None:
+            check_shape("StaticMap", "track_ids", self.track_ids, (N,))
         check_shape("StaticMap", "points_m", self.points_m, (N, 3))
         check_shape("StaticMap", "colors", self.colors, (N, 3))
         check_shape("StaticMap", "n_observations", self.n_observations, (N,))

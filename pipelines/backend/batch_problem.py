@@ -83,7 +83,9 @@ class BatchProblem:
 
     def views(self, Ts_world_camera: Array, Ts_world_object: Array) -> Array:
         """(V, 4, 4) T_body_camera: X, and P = inv(L) X of each object pose."""
-        of_objects = invert_T(Ts_world_object) @ Ts_world_camera[self.camera_of_view[self.n_frames :]]
+        of_objects = (
+            invert_T(Ts_world_object) @ Ts_world_camera[self.camera_of_view[self.n_frames :]]
+        )
         return np.concatenate([Ts_world_camera, of_objects])
 
     def with_tracks(self, tracks: PointTracks, sighting_rows: Index) -> BatchProblem:
@@ -216,7 +218,7 @@ def _weigh(problem: BatchProblem) -> PointTracks:
     key = (tracks.view * (cell[:, 1].max(initial=0) + 1) + cell[:, 1]) * (
         cell[:, 0].max(initial=0) + 1
     ) + cell[:, 0]
-    pairs, first = np.unique(key, return_index=True)
+    _, first = np.unique(key, return_index=True)
     n_cells = np.bincount(tracks.view[first], minlength=tracks.n_views)
     n_points = np.bincount(tracks.view, minlength=tracks.n_views)
     factor = np.sqrt(n_points / np.maximum(n_cells, 1))[tracks.view]

@@ -129,11 +129,11 @@ def linear_graph(
     import gtsam
 
     linear = graph.linearize(values)
-    F, O = problem.n_frames, len(problem.Ts_world_object)
-    keys = [camera_key(k) for k in range(F)] + [object_key(o) for o in range(O)]
+    F, n_poses = problem.n_frames, len(problem.Ts_world_object)
+    keys = [camera_key(k) for k in range(F)] + [object_key(o) for o in range(n_poses)]
     first, second, blocks, gradient = pose_system(problem, system, views)
     diagonal = first == second
-    own = np.zeros((F + O, 6, 6))
+    own = np.zeros((F + n_poses, 6, 6))
     own[first[diagonal]] = blocks[diagonal]
     corner = np.arange(6)
     own[:, corner, corner] += damping * own[:, corner, corner] + 1e-9
@@ -194,14 +194,15 @@ def _moved(
     views: Array,
 ) -> tuple[BatchProblem, gtsam.Values]:
     """All poses and points after a step, and the poses once more as gtsam holds them."""
-    F, O = problem.n_frames, len(problem.Ts_world_object)
+    F, n_poses = problem.n_frames, len(problem.Ts_world_object)
     steps = np.array(
-        [delta.at(camera_key(k)) for k in range(F)] + [delta.at(object_key(o)) for o in range(O)]
+        [delta.at(camera_key(k)) for k in range(F)]
+        + [delta.at(object_key(o)) for o in range(n_poses)]
     )
     moved = values.retract(delta)
     of_views = steps[problem.camera_of_view]
     A = adjoint(invert_T(views[F:]))
     of_views[F:] -= np.einsum("oij,oj->oi", A, steps[F:])
     Xs = np.array([moved.atPose3(camera_key(k)).matrix() for k in range(F)])
-    Ls = np.array([moved.atPose3(object_key(o)).matrix() for o in range(O)]).reshape(-1, 4, 4)
+    Ls = np.array([moved.atPose3(object_key(o)).matrix() for o in range(n_poses)]).reshape(-1, 4, 4)
     return problem.at(Xs, Ls, problem.points_m + system.step_points(of_views)), moved

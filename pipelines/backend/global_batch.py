@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.backend.batch_problem import BatchProblem, build_problem
-from pipelines.backend.batch_solver import Solution, solve
+from pipelines.backend.batch_solver import solve
 from pipelines.backend.guard import CAMERA, Verdict, judge
 from pipelines.backend.held_out import hold_out
 from pipelines.backend.marginals import PoseCovariances, pose_covariances
@@ -22,7 +22,7 @@ from pipelines.backend.point_elimination import Residuals
 from pipelines.config import BatchConfig
 from pipelines.frame_observations import FrameObservations
 from pipelines.object_types import ObjectEstimates
-from pipelines.types import StereoCamera
+from pipelines.types import Array, StereoCamera
 
 _MIN_FRAMES = 3
 _GATE_UV, _GATE_DISPARITY = 9.21**0.5, 6.63**0.5  # chi-square 99 %, 2 and 1 degrees of freedom
@@ -36,13 +36,14 @@ class BatchResult:
 
     before, after: the problem at the front-end's answer and at the batch's; what was refused is in
     `after` as it was in `before`. verdicts: of the cameras first. covariances: at the batch's
-    optimum. cost_before, cost_after: robust costs. n_outliers: pixels and disparities left out.
+    optimum, None where they were not wanted. cost_before, cost_after: robust costs. n_outliers:
+    pixels and disparities left out.
     """
 
     before: BatchProblem
     after: BatchProblem
     verdicts: tuple[Verdict, ...]
-    covariances: PoseCovariances
+    covariances: PoseCovariances | None
     cost_before: float
     cost_after: float
     n_outliers: int
@@ -82,9 +83,7 @@ def run_global_batch(
         return None
     tracks, rows, held = hold_out(start.tracks, start.sighting_rows, config.held_out_share)
     problem = start.with_tracks(tracks, rows)
-    graph = pose_graph(
-        problem, config.acceleration_mps2, config.turn_radps2, config.planar_sigma
-    )
+    graph = pose_graph(problem, config)
     total, done = config.rounds * config.max_steps + 2, 0
 
     def step() -> None:
@@ -100,25 +99,21 @@ def run_global_batch(
         if number == 0:
             cost_before = solution.cost_before
         if number + 1 < config.rounds:
-            keep_uv, keep_disparity = _inliers(solution.residuals)
+            keep_uv, keep_disparity = inliers(solution.residuals)
         done = (number + 1) * config.max_steps
     assert solution is not None
     verdicts = judge(problem, solution.problem, held)
     step()
-    covariances = pose_covariances(solution.problem, graph, solution.residuals)
+    covariances = None
+    if config.covariances and verdicts[CAMERA].accepted:
+        covariances = pose_covariances(solution.problem, graph, solution.residuals)
     step()
-    return BatchResult(
-        problem,
-        _accept(problem, solution, verdicts),
-        verdicts,
-        covariances,
-        cost_before,
-        solution.cost,
-        int((~keep_uv).sum() + (~keep_disparity).sum()),
-    )
+    n_outliers = int((~keep_uv).sum() + (~keep_disparity).sum())
+    costs = np.array([cost_before, solution.cost])
+    return as_result(problem, solution.problem, verdicts, covariances, costs, n_outliers)
 
 
-def _inliers(residuals: Residuals) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def inliers(residuals: Residuals) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which pixels and disparities (N,) each pass the chi-square test, and lie before the camera.
 
     What was left out of the residuals is 0 there and passes: it is tried again.
@@ -127,11 +122,25 @@ def _inliers(residuals: Residuals) -> tuple[NDArray[np.bool_], NDArray[np.bool_]
     return size <= _GATE_UV, np.abs(residuals.disparity) <= _GATE_DISPARITY
 
 
+def as_result(
+    before: BatchProblem,
+    solved: BatchProblem,
+    verdicts: tuple[Verdict, ...],
+    covariances: PoseCovariances | None,
+    costs: Array,
+    n_outliers: int,
+) -> BatchResult:
+    """What is left of a solution by its verdicts. costs: (2,) before and after."""
+    after = _accept(before, solved, verdicts)
+    return BatchResult(
+        before, after, verdicts, covariances, float(costs[0]), float(costs[1]), n_outliers
+    )
+
+
 def _accept(
-    before: BatchProblem, solution: Solution, verdicts: tuple[Verdict, ...]
+    before: BatchProblem, after: BatchProblem, verdicts: tuple[Verdict, ...]
 ) -> BatchProblem:
     """The solution, but for objects that got worse; nothing of it where the cameras did."""
-    after = solution.problem
     if not verdicts[CAMERA].accepted:
         return before
     poses = after.Ts_world_object.copy()

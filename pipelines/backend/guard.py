@@ -14,7 +14,8 @@ from pipelines.backend.held_out import HeldOut, held_out_errors
 from pipelines.backend.point_elimination import settle_points
 from pipelines.types import Array
 
-_TOLERANCE = 1.002  # of an error, to be as good as before: exact inputs leave noise alone
+_TOLERANCE = 1.002  # of an error, up to which it is as good as before
+_SIGNIFICANT = 1.0  # standard deviations of the growth, below which it may be chance
 CAMERA = 0  # body of the static world
 
 
@@ -22,19 +23,23 @@ CAMERA = 0  # body of the static world
 class Verdict:
     """Held-out errors of one body, in standard deviations (RMS), before and after the batch.
 
-    object_id: 0 for the static world, by which the cameras are judged. n_held_out: numbers of
-    sightings behind it; without any there is nothing to object to.
+    object_id: 0 for the static world, by which the cameras are judged. n_held_out: sightings behind
+    it; without any there is nothing to object to. worse_by: mean growth of their squared errors,
+    in that mean's own standard deviations.
     """
 
     object_id: int
     n_held_out: int
     before: float
     after: float
+    worse_by: float
 
     @property
     def accepted(self) -> bool:
         """Whether the batch made it no worse."""
-        return self.n_held_out == 0 or self.after <= _TOLERANCE * self.before
+        return self.n_held_out == 0 or (
+            self.after <= _TOLERANCE * self.before or self.worse_by < _SIGNIFICANT
+        )
 
 
 def judge(before: BatchProblem, after: BatchProblem, held: HeldOut) -> tuple[Verdict, ...]:
@@ -49,8 +54,15 @@ def judge(before: BatchProblem, after: BatchProblem, held: HeldOut) -> tuple[Ver
     verdicts = []
     for object_id in np.unique([CAMERA, *(s.object_id for s in before.stretches)]):
         own = owner == object_id
-        sizes = [float(np.sqrt(e[own].mean())) if own.any() else np.nan for e in errors]
-        verdicts.append(Verdict(int(object_id), int(own.sum()), sizes[0], sizes[1]))
+        n = int(own.sum())
+        if n == 0:
+            verdicts.append(Verdict(int(object_id), 0, np.nan, np.nan, np.nan))
+            continue
+        sizes = [float(np.sqrt(e[own].mean())) for e in errors]
+        growth = errors[1][own] - errors[0][own]
+        chance = float(growth.std() / np.sqrt(n))
+        worse_by = float(growth.mean()) / max(chance, 1e-12)
+        verdicts.append(Verdict(int(object_id), n, sizes[0], sizes[1], worse_by))
     return tuple(verdicts)
 
 

@@ -68,8 +68,9 @@ def _fill_stretch(
         block = range(max(begin - 1, first), min(begin + _AT_A_TIME, end))
         joint = tree.jointMarginalCovariance([object_key(o) for o in block])
         for o in block:
-            key, before = object_key(o), object_key(o - 1)
+            key = object_key(o)
             objects[o] = joint.at(key, key)
             if o > block[0]:
+                before = object_key(o - 1)
                 cross = joint.at(before, key)
                 steps[o] = objects[o] + joint.at(before, before) - cross - cross.T

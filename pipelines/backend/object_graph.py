@@ -9,8 +9,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.backend.batch_problem import BatchProblem, Stretch
+from pipelines.config import BatchConfig
 from pipelines.types import Array
 
 if TYPE_CHECKING:
@@ -36,35 +38,31 @@ def object_key(o: int) -> int:
 
 
 def pose_graph(
-    problem: BatchProblem, acceleration_mps2: float, turn_radps2: float, planar_sigma: float
+    problem: BatchProblem, config: BatchConfig, n_held: int = 1
 ) -> gtsam.NonlinearFactorGraph:
-    """Priors on the first camera and the first pose of each stretch, and smoothness.
+    """Priors on the first cameras and on the first pose of each stretch, and smoothness.
 
-    acceleration_mps2, turn_radps2: standard deviations of the change of an object's velocity, along
-    and about each of its axes, per second. planar_sigma: of a road vehicle's tilt and lift in a
-    step, as a share of its way, 0 = none.
+    n_held: how many cameras are held where they are.
     """
     import gtsam
 
     graph = gtsam.NonlinearFactorGraph()
     gauge = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([_GAUGE_RAD, _GAUGE_M], 3))
-    first = gtsam.Pose3(problem.Ts_world_camera[0])
-    graph.add(gtsam.PriorFactorPose3(camera_key(0), first, gauge))
+    for k, T in enumerate(problem.Ts_world_camera[:n_held]):
+        graph.add(gtsam.PriorFactorPose3(camera_key(k), gtsam.Pose3(T), gauge))
     for stretch in problem.stretches:
         o = stretch.first_pose
         begin = gtsam.Pose3(problem.Ts_world_object[o])
         graph.add(gtsam.PriorFactorPose3(object_key(o), begin, gauge))
         times = problem.timestamps_s[stretch.frames]
         for n in range(2, len(stretch)):
-            graph.add(_smoothness(o + n, np.diff(times[n - 2 : n + 1]), acceleration_mps2, turn_radps2))
-        if planar_sigma > 0.0 and stretch.class_name in ROAD_VEHICLES:
-            _add_planar(graph, problem, stretch, planar_sigma)
+            graph.add(_smoothness(o + n, np.diff(times[n - 2 : n + 1]), config))
+        if config.planar_sigma > 0.0 and stretch.class_name in ROAD_VEHICLES:
+            _add_planar(graph, problem, stretch, config.planar_sigma)
     return graph
 
 
-def _smoothness(
-    o: int, dts_s: Array, acceleration_mps2: float, turn_radps2: float
-) -> gtsam.CustomFactor:
+def _smoothness(o: int, dts_s: Array, config: BatchConfig) -> gtsam.CustomFactor:
     """The velocities of the steps to poses o - 1 and o, in the object's axes, are alike.
 
     r = Log(inv(B) C) / dt2 - Log(inv(A) B) / dt1 for poses A, B, C; for equal dt this is, to first
@@ -72,14 +70,15 @@ def _smoothness(
     """
     import gtsam
 
-    sigmas = np.repeat([turn_radps2, acceleration_mps2], 3) * float(dts_s.mean())
+    sigmas = np.repeat([config.turn_radps2, config.acceleration_mps2], 3) * float(dts_s.mean())
     loss = gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY)
     noise = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
     dt1, dt2 = (float(dt) for dt in dts_s)
     Pose3 = gtsam.Pose3
+    keys = [object_key(o - 2), object_key(o - 1), object_key(o)]
 
-    def error(factor: Any, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        A, B, C = (values.atPose3(key) for key in factor.keys())
+    def error(factor: Any, values: gtsam.Values, jacobians: Any) -> NDArray[np.float64]:
+        A, B, C = (values.atPose3(key) for key in keys)
         d1, d2 = A.between(B), B.between(C)
         if jacobians is not None:
             J1, J2 = Pose3.LogmapDerivative(d1) / dt1, Pose3.LogmapDerivative(d2) / dt2
@@ -88,7 +87,7 @@ def _smoothness(
             jacobians[2] = J2
         return Pose3.Logmap(d2) / dt2 - Pose3.Logmap(d1) / dt1
 
-    return gtsam.CustomFactor(noise, [object_key(o - 2), object_key(o - 1), object_key(o)], error)
+    return gtsam.CustomFactor(noise, keys, error)
 
 
 def _add_planar(

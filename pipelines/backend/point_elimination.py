@@ -4,8 +4,8 @@ Owns the model of what was seen, its robust weights, and the Schur complement: w
 of the views, once each point has been chosen best. Knows neither bodies nor graphs.
 
 The model: where a point was followed from one frame to the next, the *step* of its pixel was
-measured, and errors of steps add up along the track; disparities err anew in each frame. Measured on
-degraded sequences: the error of a followed pixel grows with the square root of the frames since,
+measured, and errors of steps add up along the track; disparities err anew in each frame. Measured
+on degraded sequences: the error of a followed pixel grows with the square root of the frames since,
 that of its disparity does not grow.
 Deviation: DESIGN's graph has one stereo factor a sighting, with independent errors.
 """
@@ -25,7 +25,10 @@ HUBER_UV, HUBER_DISPARITY = 2.45, 1.96  # standard deviations: 95 % in two dimen
 _DENSE_BYTES = 1 << 23  # of one block of tracks that is eliminated at a time
 _LENGTH_BINS = (4, 8, 16, 32, 64)  # tracks of like length are eliminated together
 _SETTLE_DAMPING = 1e-4
+_SIGHTINGS_A_PART = 200_000
 _MAX_BAND = 128  # views that a track may span to be eliminated by dense blocks
+
+Blocks = tuple[Index, Index, Array]  # pairs of views (M,), first <= second, and (M, 6, 6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,8 +178,32 @@ def eliminate_points(
     damping: float,
 ) -> ViewSystem:
     """The system of the views at an estimate. damping: of the points, Levenberg's share."""
-    seen = _whiten(camera, tracks, Ts_body_camera, points_m, residuals)
-    H_inverse, g = _point_system(seen, tracks, damping)
+    V = tracks.n_views
+    gradient = np.zeros((V, 6))
+    H_inverse, g = np.empty((tracks.n_tracks, 3, 3)), np.empty((tracks.n_tracks, 3))
+    C = np.empty((len(tracks), 3, 6), np.float32)  # the largest array: twice as long runs fit
+    parts: list[Blocks] = [sum_blocks(np.empty(0, int), np.empty(0, int), np.empty((0, 6, 6)), V)]
+    for own, rows, part in tracks.parts(_SIGHTINGS_A_PART):
+        few = Residuals(
+            residuals.uv[rows],
+            residuals.disparity[rows],
+            residuals.weight_uv[rows],
+            residuals.weight_disparity[rows],
+            0.0,
+        )
+        seen = _whiten(camera, part, Ts_body_camera, points_m[own], few)
+        H_inverse[own], g[own] = _point_system(seen, part, damping)
+        blocks, pull, C[rows] = _eliminate_part(part, seen, H_inverse[own], g[own])
+        gradient += np.stack([np.bincount(part.view, column, V) for column in pull.T], -1)
+        first, second, values = (np.concatenate(x) for x in zip(*parts, *blocks, strict=True))
+        parts = [sum_blocks(first, second, values, V)]
+    return ViewSystem(*parts[0], gradient, H_inverse, g, C, tracks)
+
+
+def _eliminate_part(
+    tracks: PointTracks, seen: _Rows, H_inverse: Array, g: Array
+) -> tuple[list[Blocks], Array, Array]:
+    """Blocks of the views' system, pull (N, 6) on the view of each sighting, and C (N, 3, 6)."""
     rows, view, V = seen.rows, tracks.view, tracks.n_views
     Jp = pose_jacobian(seen.projection, seen.in_camera)  # d prediction / d view
     B = np.empty((len(tracks), 3, 6))
@@ -185,22 +212,20 @@ def eliminate_points(
     # A step also depends on the view before: that is a part of the next row, in this view's place
     before = -seen.w_before[:, None, None] * np.roll(Jp[:, :2], 1, axis=0)
     after = np.roll(before, -1, axis=0)
-    B_t, after_t = B.transpose(0, 2, 1), after.transpose(0, 2, 1)
     C = seen.A.transpose(0, 2, 1) @ B
     C += np.roll(seen.A[:, :2], -1, axis=0).transpose(0, 2, 1) @ after
     pull = np.einsum("nij,ni->nj", B, rows)
     pull += np.einsum("nij,ni->nj", after, np.roll(rows[:, :2], -1, axis=0))
     pull -= np.einsum("nij,ni->nj", C, np.einsum("pij,pj->pi", H_inverse, g)[tracks.track])
-    gradient = np.stack([np.bincount(view, column, V) for column in pull.T], -1)
     now = np.flatnonzero(tracks.is_followed)
     cross = before[now].transpose(0, 2, 1) @ B[now, :2]
-    parts = [
-        sum_blocks(view, view, B_t @ B + after_t @ after, V),
+    own = B.transpose(0, 2, 1) @ B + after.transpose(0, 2, 1) @ after
+    blocks = [
+        sum_blocks(view, view, own, V),
         sum_blocks(view[now - 1], view[now], cross, V),
         *_eliminated(tracks, C, np.linalg.cholesky(H_inverse)),
     ]
-    first, second, blocks = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return ViewSystem(*sum_blocks(first, second, blocks, V), gradient, H_inverse, g, C, tracks)
+    return blocks, pull, C
 
 
 def settle_points(
@@ -220,9 +245,6 @@ def settle_points(
     return points_m
 
 
-Blocks = tuple[Index, Index, Array]
-
-
 def sum_blocks(first: Index, second: Index, blocks: Array, n_views: int) -> Blocks:
     """The same pairs of views (M,) with their blocks (M, 6, 6), each pair once."""
     key = first * n_views + second
@@ -240,7 +262,8 @@ def _eliminated(tracks: PointTracks, C: Array, root: Array) -> list[Blocks]:
     low, high = tracks.view[starts], tracks.view[starts + lengths - 1]
     span = high - low + 1
     band = int(span[span <= _MAX_BAND].max(initial=1))
-    store = np.zeros((tracks.n_views, band, 6, 6))
+    lowest = int(low.min())
+    store = np.zeros((int(high.max()) + 1 - lowest, band, 6, 6))
     kind = np.where(span <= _MAX_BAND, np.searchsorted(_LENGTH_BINS, span), -1)
     for one in np.unique(kind[kind >= 0]):
         own = np.flatnonzero(kind == one)
@@ -250,12 +273,12 @@ def _eliminated(tracks: PointTracks, C: Array, root: Array) -> list[Blocks]:
         while len(own):
             fits = high[own[:most]] < low[own[0]] + width
             n = len(fits) if fits.all() else int(np.argmin(fits))
-            _eliminate_dense(tracks, E, own[:n], starts, lengths, int(low[own[0]]), store)
+            _eliminate_dense(tracks, E, own[:n], starts, lengths, lowest, store)
             own = own[n:]
     parts = []
     used = np.abs(store).max(axis=(2, 3)) > 0.0
     first, offset = np.nonzero(used)
-    parts.append((first, first + offset, -store[used]))
+    parts.append((lowest + first, lowest + first + offset, -store[used]))
     for t in np.flatnonzero(kind < 0):
         rows = np.arange(starts[t], starts[t] + lengths[t])
         i, j = np.triu_indices(len(rows))
@@ -270,12 +293,13 @@ def _eliminate_dense(
     chunk: Index,
     starts: Index,
     lengths: Index,
-    v0: int,
+    lowest: int,
     store: Array,
 ) -> None:
-    """Add E' E of some tracks, whose views begin at `v0`, to the band `store` (V, band, 6, 6)."""
+    """Add E' E of tracks of like views to the band `store` (views from `lowest`, band, 6, 6)."""
     n_rows = lengths[chunk]
     rows = np.repeat(starts[chunk] - np.cumsum(n_rows) + n_rows, n_rows) + np.arange(n_rows.sum())
+    v0 = int(tracks.view[rows].min())
     views = tracks.view[rows] - v0
     width = int(views.max()) + 1
     dense = np.zeros((len(chunk), 3, width, 6))
@@ -285,4 +309,4 @@ def _eliminate_dense(
     band = store.shape[1]
     for a in range(width):
         n = min(width - a, band)
-        store[v0 + a, :n] += product[a, a : a + n]
+        store[v0 - lowest + a, :n] += product[a, a : a + n]

@@ -6,6 +6,7 @@ one frame's camera saw it; a *track* is one point of one body in all its views.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -57,6 +58,19 @@ class PointTracks:
         arrays = {f.name: getattr(self, f.name)[rows] for f in fields(self)[:7]}
         arrays["track"] = number[arrays["track"]]
         return PointTracks(**arrays, n_tracks=int(keep.sum()), n_views=self.n_views)
+
+    def parts(self, most: int) -> Iterator[tuple[slice, slice, PointTracks]]:
+        """The tracks and rows of consecutive parts of about `most` sightings, each from track 0."""
+        ends = np.cumsum(self.lengths)
+        begin, row = 0, 0
+        while begin < self.n_tracks:
+            end = max(begin + 1, int(np.searchsorted(ends, row + most, side="right")))
+            rows = slice(row, int(ends[end - 1]))
+            arrays = {f.name: getattr(self, f.name)[rows] for f in fields(self)[:7]}
+            arrays["track"] = arrays["track"] - begin
+            part = PointTracks(**arrays, n_tracks=end - begin, n_views=self.n_views)
+            yield slice(begin, end), rows, part
+            begin, row = end, rows.stop
 
     def with_sigmas(self, sigma_uv_px: Array, sigma_disparity_px: Array) -> PointTracks:
         """The same with other weights, (N,) each."""

@@ -252,4 +252,5 @@ class SparseMap:
             self.n_found[ids].copy(),
             self._keyframe_Ts.copy(),
             np.array([k.frame_index for k in self.keyframes], np.int64),
+            self.serial[ids].copy(),
         )
