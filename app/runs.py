@@ -145,11 +145,10 @@ def _process(sequence: Any, config: Any, arguments: Namespace, span: dict[str, A
     sinks: list[Any] = [] if arguments.quiet else [console.Progress()]
     if arguments.pictures:
         sinks.append(FrameWriter(every=arguments.pictures))
-    with console.warnings():
-        with console.counting("optimising", arguments.quiet) as optimising:
-            result = run_sequence(
-                sequence, config, arguments.output, **span, sinks=sinks, batch_progress=optimising
-            )
+    with console.warnings(), console.counting("optimising", arguments.quiet) as optimising:
+        result = run_sequence(
+            sequence, config, arguments.output, **span, sinks=sinks, batch_progress=optimising
+        )
     if not arguments.quiet:
         console.metrics(result.metrics, result.timings, console.shorten(result.folder))
     return result

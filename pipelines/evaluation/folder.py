@@ -27,8 +27,8 @@ def evaluate_result(folder: Path | str) -> dict[str, Any]:
     """Renew metrics.json and metrics.txt of a result folder by its other files; all its metrics.
 
     Without camera_gt_tum.txt there is no "camera" block, and without objects_gt.csv no "objects"
-    block; "front_end" holds the same blocks for what a batch started from. Others stay as they are. Raises FormatError where `folder` is no result folder or a
-    file of it is damaged.
+    block; "front_end" holds the same of what a batch started from. Other blocks stay as they are.
+    Raises FormatError where `folder` is no result folder or a file of it is damaged.
     """
     result = load_result(folder)
     own = ("camera", "objects", "front_end")
