@@ -73,13 +73,15 @@ def run_global_batch(
     Returns None where there is too little to optimise. Two rounds: chi-square outliers of the
     first are left out of the second. progress: called with (done, total) as it goes.
     """
+    if not has_enough(log):
+        return None
     start = build_problem(
         camera,
         log,
         objects if config.objects else ObjectEstimates.empty(),
         config.max_static_per_frame,
     )
-    if start.n_frames < _MIN_FRAMES or len(start.tracks) == 0:
+    if len(start.tracks) == 0:
         return None
     tracks, rows, held = hold_out(start.tracks, start.sighting_rows, config.held_out_share)
     problem = start.with_tracks(tracks, rows)
@@ -111,6 +113,11 @@ def run_global_batch(
     n_outliers = int((~keep_uv).sum() + (~keep_disparity).sum())
     costs = np.array([cost_before, solution.cost])
     return as_result(problem, solution.problem, verdicts, covariances, costs, n_outliers)
+
+
+def has_enough(log: Sequence[FrameObservations]) -> bool:
+    """Whether there are frames enough to optimise."""
+    return sum(entry.is_tracked for entry in log) >= _MIN_FRAMES
 
 
 def inliers(residuals: Residuals) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

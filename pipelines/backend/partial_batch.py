@@ -14,7 +14,7 @@ import numpy as np
 
 from pipelines.backend.batch_problem import BatchProblem, build_problem
 from pipelines.backend.batch_solver import solve
-from pipelines.backend.global_batch import BatchResult, as_result, inliers
+from pipelines.backend.global_batch import BatchResult, as_result, has_enough, inliers
 from pipelines.backend.guard import judge
 from pipelines.backend.held_out import hold_out
 from pipelines.backend.object_graph import pose_graph
@@ -38,8 +38,10 @@ def run_partial_batch(
     Returns None where there is too little to optimise. The result has no covariances: each window
     knows its own frames alone.
     """
+    if not has_enough(log):
+        return None
     start = build_problem(camera, log, ObjectEstimates.empty(), config.max_static_per_frame)
-    if start.n_frames < 3 or len(start.tracks) == 0:
+    if len(start.tracks) == 0:
         return None
     tracks, rows, held = hold_out(start.tracks, start.sighting_rows, config.held_out_share)
     before = start.with_tracks(tracks, rows)

@@ -87,6 +87,12 @@ def build_tracks(
     the frame just before.
     """
     rows = np.flatnonzero(body >= 0)
+    if len(rows) == 0:
+        nothing, none = np.empty(0, np.int64), np.empty(0)
+        tracks = PointTracks(
+            nothing, nothing, np.empty(0, bool), np.empty((0, 2)), none, none, none, 0, n_views
+        )
+        return tracks, nothing
     order = np.lexsort((view[rows], sightings.track_id[rows], body[rows]))
     rows = rows[order]
     b, t, k = body[rows], sightings.track_id[rows], frame_order[rows]

@@ -31,6 +31,7 @@ FILES = {
     "camera_gt_tum.txt",
     "objects_gt.csv",
 }
+BATCH = {"front_end", "observations", "camera_std.csv"}
 TRAJECTORIES = {"objects"}  # a folder, where there was an object
 TRUTH = {
     "vdo": ("pose_gt.txt", "object_pose.txt"),
@@ -91,7 +92,7 @@ def whole(street, tmp_path_factory) -> tuple[Result, Witness]:
 
 def test_the_folder_holds_the_files_of_the_design_and_no_others(whole) -> None:
     folder = whole[0].folder
-    assert names_in(folder) == FILES | TRAJECTORIES
+    assert names_in(folder) == FILES | TRAJECTORIES | BATCH
     ids = np.unique(whole[0].objects.object_id)
     assert len(ids) > 5
     written = {path.name for path in (folder / "objects").iterdir()}
@@ -300,7 +301,7 @@ def test_ctrl_c_leaves_the_frames_done_so_far(street, tmp_path, whole, at: int) 
     witness = Witness(at, KeyboardInterrupt())
     result = run(street, output=tmp_path / "partial", sinks=[witness])
     assert witness.told == ["start"] + ["frame"] * (at + 1) + ["finish"]
-    assert names_in(result.folder) == FILES | TRAJECTORIES
+    assert names_in(result.folder) == FILES | TRAJECTORIES | {"observations"}  # no batch
     counts = result.metrics["run"]
     assert counts["interrupted"] is True
     assert counts["frames"] == counts["tracked"] == at + 1
@@ -362,7 +363,7 @@ def test_deleted_truth_changes_no_byte_of_the_estimate(dataset, request, tmp_pat
     expected = FILES - {"camera_gt_tum.txt", "objects_gt.csv"}
     if dataset != "kitti_odometry":  # a street without traffic
         expected |= TRAJECTORIES
-    assert names_in(without.folder) == expected
+    assert names_in(without.folder) == expected | BATCH
     assert without.metrics["run"]["tracked"] > 5
     assert estimates(with_truth.folder) == estimates(without.folder)
     if dataset == "vdo":  # its masks make objects at once: bytes of something were compared
