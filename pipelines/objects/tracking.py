@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import ObjectsConfig
+from pipelines.frame_observations import Sightings
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
 from pipelines.geometry import (
@@ -34,6 +35,7 @@ from pipelines.objects.motion import move_points
 from pipelines.objects.motion_intake import MotionIntake
 from pipelines.objects.points import ObjectPoints, choose_pixels, points_wanted
 from pipelines.objects.rows import RowTable
+from pipelines.objects.sightings import collect_sightings
 from pipelines.objects.solver import MotionSolver, Solution
 from pipelines.objects.track import ObjectTrack
 from pipelines.types import Array
@@ -52,6 +54,7 @@ class ObjectTracker:
         self._solver = MotionSolver(sensor, config, seed)
         self._last: LastObjects | None = None
         self._next_id = 1
+        self.sightings = Sightings.empty()  # of the last frame, for the observation log
 
     # ----------------------------------------------------------- association
 
@@ -262,10 +265,22 @@ class ObjectTracker:
         self._take_rest(table, view, frame, measured_ids, T_world_camera)
         moved = [self._solver.refine(solution) for solution in solutions]
         points = self._renew_points(view, frame, T_world_camera, ObjectPoints.concatenate(*moved))
+        self._note_sightings(view, solutions, moved, points)
         self._last = LastObjects(
             view, T_world_camera, is_tracked, frame.labels, dict(frame.windows), points
         )
         return table.estimates()
+
+    def _note_sightings(
+        self, view: View, solutions: list[Solution], moved: list[ObjectPoints], points: ObjectPoints
+    ) -> None:
+        last = self._last
+        before = ObjectPoints.empty() if last is None else last.points
+        frames = (-1 if last is None else last.view.frame_index, view.frame_index)
+        sigma = self.sensor.noise.sigma_disparity_px
+        self.sightings = collect_sightings(
+            self.camera, frames, solutions, moved, before, points, sigma
+        )
 
     def _solve(self, view: View, frame: ObjectFrame, T_world_camera: Array) -> list[Solution]:
         """Eq. (3) for all objects in sight, and once more for those that flow has lost."""
