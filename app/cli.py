@@ -42,7 +42,9 @@ VERBS = {
 run DATA                        # the layout is guessed from the folder
 run DATA --dataset tum_rgbd --frames 100 --stride 2
 run simulated:street --degrade --seed 7
-run DATA --set orb.n_features=1500 --output my_result""",
+run DATA --set orb.n_features=1500 --output my_result
+run DATA --save-map my_map      # and later, where the map is known:
+run DATA --load-map my_map --localize""",
     ),
     "eval": Verb(
         "app.runs:evaluate",
@@ -224,8 +226,19 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         help="simulated sequences: which inputs come, of depth,flow,masks,right; 'right' alone is "
         "a stereo camera and nothing else (default: depth,flow,masks)",
     )
+    _add_maps(parser)
     _add_settings(parser)
     _add_output(parser)
+
+
+def _add_maps(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--save-map", metavar="DIR", help="folder to leave the map in at the end")
+    parser.add_argument(
+        "--load-map", metavar="DIR", help="map to begin with and continue, in its world"
+    )
+    parser.add_argument(
+        "--localize", action="store_true", help="with --load-map: the map stays as it is"
+    )
 
 
 def _add_output(parser: argparse.ArgumentParser) -> None:

@@ -22,7 +22,9 @@ def run(arguments: Namespace) -> int:
     """`run PATH`: 0 when all frames were tried, 130 after Ctrl-C (the result is valid then)."""
     from pipelines.config import load_config
     from pipelines.datasets import open_sequence
+    from pipelines.lasting_map import LastingMap
 
+    maps = LastingMap(arguments.load_map, arguments.save_map, arguments.localize)
     overrides = list(arguments.overrides)
     if arguments.seed is not None:
         overrides.append(f"tracking.seed={arguments.seed}")
@@ -36,7 +38,7 @@ def run(arguments: Namespace) -> int:
             options["progress"] = progress
         sequence = open_sequence(arguments.path, arguments.dataset, arguments.sequence, **options)
     span = {"start": arguments.start, "frames": arguments.frames, "stride": arguments.stride}
-    result = _process(sequence, config, arguments, span)
+    result = _process(sequence, config, arguments, span, lasting_map=maps)
     folder = console.shorten(result.folder)
     if arguments.quiet:
         console.say(folder)
@@ -137,7 +139,9 @@ def _keep_freed_memory() -> None:
         libc.mallopt(_M_TRIM_THRESHOLD, (1 << 31) - 1)
 
 
-def _process(sequence: Any, config: Any, arguments: Namespace, span: dict[str, Any]) -> Any:
+def _process(
+    sequence: Any, config: Any, arguments: Namespace, span: dict[str, Any], **more: Any
+) -> Any:
     from pipelines.runner import run as run_sequence
     from viz.overlay import FrameWriter
 
@@ -147,7 +151,13 @@ def _process(sequence: Any, config: Any, arguments: Namespace, span: dict[str, A
         sinks.append(FrameWriter(every=arguments.pictures))
     with console.warnings(), console.counting("optimising", arguments.quiet) as optimising:
         result = run_sequence(
-            sequence, config, arguments.output, **span, sinks=sinks, batch_progress=optimising
+            sequence,
+            config,
+            arguments.output,
+            **span,
+            **more,
+            sinks=sinks,
+            batch_progress=optimising,
         )
     if not arguments.quiet:
         console.metrics(result.metrics, result.timings, console.shorten(result.folder))

@@ -258,6 +258,10 @@ class PlacesConfig:
     # path of a vocabulary: .npz of `models train-vocabulary`, or DBoW2's or DBoW3's .txt, .yml,
     # .yml.gz; empty = the one that comes with the program
     vocabulary: str = ""
+    relocalise_among: int = 5  # keyframes most like a view that are tried when tracking is lost
+
+    def __post_init__(self) -> None:
+        _check(self, relocalise_among=(0, 100))
 
 
 @dataclass(frozen=True, slots=True)

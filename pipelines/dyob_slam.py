@@ -7,6 +7,7 @@ steps have the numbers of the design.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -15,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.backend.seen_places import SeenPlaces
 from pipelines.config import Config
 from pipelines.depth import StereoDepth
 from pipelines.detection.geometry import MultiViewGeometry
@@ -44,6 +46,7 @@ from pipelines.types import (
 )
 
 _LANDMARK_MARGIN = 0.2  # features and pixels lie off objects in shares that differ by less
+_log = logging.getLogger("dyob.slam")
 
 
 class DyObSlam:
@@ -53,14 +56,33 @@ class DyObSlam:
     >>> result = slam.process(sequence.read(0))
     """
 
-    def __init__(self, camera: StereoCamera, config: Config | None = None) -> None:
+    def __init__(
+        self,
+        camera: StereoCamera,
+        config: Config | None = None,
+        known_map: SparseMap | None = None,
+        localize: bool = False,
+    ) -> None:
+        """known_map: of an earlier run, whose world holds; it is continued, and so it changes.
+
+        Every frame is LOST then until one is recognised in it. localize: the map is only read.
+        Raises ValueError for localize without a map, FormatError for a damaged vocabulary.
+        """
+        if localize and known_map is None:
+            raise ValueError("DyObSlam: localize needs a known_map to find the camera in")
         self.camera = camera
         self.config = config or Config()
-        self.map = SparseMap(camera, self.config.mapping)
+        self.map = SparseMap(camera, self.config.mapping) if known_map is None else known_map
+        if known_map is not None and not localize:
+            known_map.detach_offset()
+        self.localize = localize
+        self._knows_the_world = known_map is not None  # which then has its origin elsewhere
+        self.places = SeenPlaces(self.config.places)
+        self.places.add_map(self.map)
         self._orb = OrbExtractor(self.config.orb)
         self._stereo: StereoDepth | None = None
         self.sensor = Sensor(camera, self.config.depth)
-        self._tracker = Tracker(self.sensor, self.config.tracking)
+        self._tracker = Tracker(self.sensor, self.config.tracking, self.places.alike)
         self._mapping = LocalMapping(self.sensor, self.config.mapping, self.config.orb)
         self._segmentation = Segmentation(self.config.detector)
         self._flow = DenseFlow(self.config.flow)
@@ -88,14 +110,14 @@ class DyObSlam:
             view = view.masked(self._labels_that_move(objects, view), self._dilation_px)
         # 4. Camera pose
         tracked = self._track(view)
+        # Across a jump no motion can be told, of objects neither: as after a LOST frame
+        covariance = np.full((6, 6), np.nan) if tracked.is_jump else tracked.covariance
         # 6. Multi-view geometry repairs masks, and finds what no detector knows
         with self._stage("geometry"):
             view = self._apply_geometry(prepared, view, tracked, objects)
         # 8, 9 and 5. Object motion, Kalman filters, what moves
         with self._stage("objects"):
-            estimates = self._objects.estimate(
-                view, objects, tracked.T_world_camera, tracked.covariance
-            )
+            estimates = self._objects.estimate(view, objects, tracked.T_world_camera, covariance)
             view, tracked = self._forget_landmarks(view, tracked, objects)
         # 10. Sparse map
         with self._stage("mapping"):
@@ -153,12 +175,15 @@ class DyObSlam:
         return self._stereo.compute(frame.image, frame.image_right)
 
     def _track(self, view: View) -> TrackedFrame:
-        if self._tracker.motion is None:
+        if self._tracker.motion is None and not self._knows_the_world:
             return self._start(view, np.eye(4))
+        motion = self._tracker.motion or self._tracker.start(view, np.eye(4))
         tracked = self._tracker.track(view, self.map, self._stage)
         if tracked.status is TrackingStatus.OK:
-            self._tracker.motion.update(
-                tracked.T_world_camera, view.timestamp_s, continuous=self._lost_frames == 0
+            motion.update(
+                tracked.T_world_camera,
+                view.timestamp_s,
+                continuous=self._lost_frames == 0 and not tracked.is_jump,
             )
             self._lost_frames = 0
             return tracked
@@ -166,8 +191,24 @@ class DyObSlam:
         if len(self._mapping.mappable_features(view, Tracks.empty())):
             self._lost_frames += 1
         if self._lost_frames >= self.config.tracking.restart_after_frames:
-            return self._start(view, tracked.T_world_camera)
+            if self._may_start_anew:
+                return self._start(view, tracked.T_world_camera)
+            if self._lost_frames == self.config.tracking.restart_after_frames:
+                _log.warning(
+                    "frame %d: the place is not recognised in the loaded map after %d frames; "
+                    "frames stay LOST until one is",
+                    view.frame_index,
+                    self._lost_frames,
+                )
         return tracked
+
+    @property
+    def _may_start_anew(self) -> bool:
+        """Whether a new piece of map may begin where the motion led.
+
+        Not before a loaded map was recognised: nothing would tie the piece to that map's world.
+        """
+        return not self.localize and (self._tracker.remembers or not self._knows_the_world)
 
     def _start(self, view: View, T_world_camera: Array) -> TrackedFrame:
         """First frame, or a new start at the predicted pose after a lost stretch.
@@ -220,7 +261,7 @@ class DyObSlam:
         self, prepared: PreparedFrame, view: View, tracked: TrackedFrame, objects: ObjectFrame
     ) -> View:
         """Step 6 on the frame's objects, which change; the view without what moves after all."""
-        if not self._uses_geometry or tracked.status is not TrackingStatus.OK:
+        if not self._uses_geometry or tracked.status is not TrackingStatus.OK or tracked.is_jump:
             return view
         noise = self.sensor.noise
         seen = GeometryView(
@@ -252,7 +293,7 @@ class DyObSlam:
             set(self._objects.landmark_ids(view.timestamp_s)),
         )
         gone = [i for i in before - self._landmarks if i in objects.windows]
-        if not gone or tracked.status is not TrackingStatus.OK:
+        if not gone or self.localize or tracked.status is not TrackingStatus.OK:
             return view, tracked
         # Widened: the points lie where the thing stood until now
         left_by = np.where(np.isin(objects.labels, gone), objects.labels, 0).astype(np.int32)
@@ -273,7 +314,12 @@ class DyObSlam:
         if tracked.status is not TrackingStatus.OK:
             self._static_tracks = Tracks.empty()
             return False
-        tracks, is_keyframe = self._mapping.integrate(self.map, view, tracked)
+        if self.localize:
+            tracks, is_keyframe = self._mapping.localize(self.map, tracked), False
+        else:
+            tracks, is_keyframe = self._mapping.integrate(self.map, view, tracked)
+        if is_keyframe:
+            self.places.add(len(self.map.keyframes) - 1, view.features.descriptors)
         self._tracker.remember(view, tracks)
         self._static_tracks = tracks
         return is_keyframe

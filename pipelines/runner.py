@@ -30,6 +30,7 @@ from pipelines.io.result import (
     load_result,
     run_metrics,
 )
+from pipelines.lasting_map import LastingMap, note_end, note_start
 from pipelines.types import Frame, FrameResult
 
 RESULTS = "results"  # folder that result folders go to, below the working folder
@@ -69,28 +70,33 @@ def run(
     stride: int = 1,
     sinks: Iterable[Sink] = (),
     batch_progress: Callable[[int, int], None] = lambda done, total: None,
+    lasting_map: LastingMap | None = None,
 ) -> Result:
     """Run the whole system on a sequence and return its result folder, read back.
 
     output: the folder to write; by default a new one under `results`, with a `latest` link.
     start, frames, stride: which frames to take, all by default. batch_progress: called with (done,
-    total) while the batch at the end runs. A frame that cannot be read is
-    skipped with a warning. Ctrl-C ends the run early with a valid, partial result. Raises
-    DatasetError where no frame is asked for or none can be read.
+    total) while the batch at the end runs. lasting_map: the map that the run begins with, and where
+    to leave its own, as the front-end made it. A frame that cannot be read is skipped with a
+    warning. Ctrl-C ends the run early with a valid, partial result. Raises
+    DatasetError where no frame is asked for or none can be read, and as `LastingMap.open`.
     """
-    config = config or Config()
+    lasting_map = lasting_map or LastingMap()
+    config = lasting_map.settings(config or Config())
     indices = _chosen_frames(len(sequence), start, frames, stride)
+    known = lasting_map.open(sequence.camera, config.mapping)
     folder = create_result_folder(RESULTS, sequence.name) if output is None else Path(output)
     clear_result_folder(folder)
     writer = ResultWriter(folder)
     writer.write_config(config_to_dict(config))
-    slam = DyObSlam(sequence.camera, config)
+    slam = DyObSlam(sequence.camera, config, known, lasting_map.localize)
     progress = _Progress()
     if config.batch.record or config.batch.at_end:
         progress.recorder = ObservationRecorder(folder / names.OBSERVATIONS, sequence.camera)
     sinks = tuple(sinks)
     with writer.log_to_file():
         _log.info("%s (%s), %d frames", sequence.name, sequence.dataset, len(indices))
+        note_start(known, lasting_map.localize)
         for sink in sinks:
             sink.start(sequence, len(indices), config, folder)
         try:
@@ -114,6 +120,8 @@ def run(
         except KeyboardInterrupt:  # once more, in peace; a second Ctrl-C ends it
             _note_interruption(progress)
             _write(writer, sequence, slam, progress)
+        note_end(known, progress.results)
+        lasting_map.keep(slam.map, progress.results)
         if config.batch.at_end and progress.results and not progress.interrupted:
             _optimise(folder, config, batch_progress)
         if progress.recorder is not None and not config.batch.record:

@@ -6,7 +6,7 @@ are found by `measurement`, poses by `motion_only_ba`; the map belongs to `mappi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
@@ -39,11 +39,15 @@ from pipelines.types import Array, MotionHypothesis, TrackingStatus
 _GATE = 2.0  # inlier limits: observations farther from the chosen hypothesis adjust it later
 _REGAINED_NEAR = 0.5  # of the way predicted since the last good frame, to be about there
 _RELOCALISED_SHARE = 0.5  # of descriptor matches that must agree with a pose found by them
-_RELOCALISE_AGAINST = 5  # latest keyframes tried when lost
+_RECOGNISED_SHARE = 0.1  # of the features, or of the map's points if fewer, at a place regained
+_RELOCALISE_AGAINST = 5  # latest keyframes tried when lost, before places by their looks
+_PLACE_NEIGHBOURS = 5  # covisible keyframes whose points help to recognise a place
+_JUMP_BASELINES = 5.0  # off the prediction at least, of a camera found at another place
 _RELOCALISE_RATIO = 0.8  # of the best to the second best distance (Lowe)
 _RELOCALISE_SLACK = 2.0  # times `inlier_px`: features lie on coarse levels too, unaligned
 
 Stage = Callable[[str], AbstractContextManager[None]]
+SeenBefore = Callable[[NDArray[np.uint8]], Sequence[int]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +57,7 @@ class TrackedFrame:
     T_world_camera: (4, 4), predicted if LOST. covariance: (6, 6) of the right perturbation
     [omega rad, v m], NaN if LOST. tracks: all points measured. inliers: (N,) bool of the tracks.
     rmse_px: of the inliers' pixels (u_L, v). visible_ids: (M,) points of the local map in view,
-    whether found or not.
+    whether found or not. is_jump: recognised at a place where the motion did not lead.
     """
 
     status: TrackingStatus
@@ -64,22 +68,43 @@ class TrackedFrame:
     inliers: NDArray[np.bool_]
     rmse_px: float
     visible_ids: NDArray[np.int64]
+    is_jump: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Guess:
+    """A pose (4, 4) to measure around; matches: of descriptors that led to it, if any did."""
+
+    T_world_camera: Array
+    matches: Measurement | None = None
 
 
 class Tracker:
     """Tracks a camera against a sparse map; step 4 of the design."""
 
-    def __init__(self, sensor: Sensor, config: TrackingConfig) -> None:
-        self.sensor, self.config = sensor, config
+    def __init__(
+        self,
+        sensor: Sensor,
+        config: TrackingConfig,
+        seen_before: SeenBefore = lambda descriptors: (),
+    ) -> None:
+        """seen_before: rows of keyframes that look like an image with ORB descriptors (N, 32)."""
+        self.sensor, self.config, self.seen_before = sensor, config, seen_before
         self.camera, self.noise = sensor.camera, sensor.noise
         self.motion: ConstantVelocity | None = None
         self._last: LastFrame | None = None
 
     # ----------------------------------------------------------------- state
 
-    def start(self, view: View, T_world_camera: Array) -> None:
-        """Begin, or begin anew, with a known pose and no velocity."""
+    @property
+    def remembers(self) -> bool:
+        """Whether there is a frame to track from; else every view must be recognised."""
+        return self._last is not None
+
+    def start(self, view: View, T_world_camera: Array) -> ConstantVelocity:
+        """Begin, or begin anew, with a known pose and no velocity; returns the motion."""
         self.motion = ConstantVelocity(T_world_camera, view.timestamp_s)
+        return self.motion
 
     def remember(self, view: View, tracks: Tracks) -> None:
         """Keep what the next frame will be tracked from."""
@@ -107,22 +132,28 @@ class Tracker:
             return self._lost(T_predicted, measured.tracks)
         with stage("pose"):
             estimate = self._adjust(sparse_map, measured.tracks, T)
-        if not self._is_trusted(estimate, T_predicted):
+        if not self._is_trusted(estimate, T_predicted, hypothesis):
             return self._lost(T_predicted, measured.tracks)
         first = not self.noise.is_learned
         self._learn_noise(sparse_map, measured, estimate)
-        if first:  # the weights were guesses: once more with what they taught
+        if first and measured.sources_px:  # the weights were guesses: again, as they taught
             measured = self._measure(view, sparse_map, estimate.T_world_camera)
             estimate = self._adjust(sparse_map, measured.tracks, estimate.T_world_camera)
         with stage("local_map"):
             T, tracks = estimate.T_world_camera, measured.tracks
             found, visible = search_local_map(view, sparse_map, tracks, T, self.sensor, self.config)
+            if not measured.sources_px:  # recognised by features alone, as coarse in depth
+                found = replace(found, disparity_px=np.full(len(found), np.nan))
             if len(found):
                 tracks = Tracks.concatenate(tracks, found)
                 estimate = self._adjust(sparse_map, tracks, T, robust_rounds=1)
-                if not self._is_trusted(estimate, T_predicted):
+                if not self._is_trusted(estimate, T_predicted, hypothesis):
                     return self._lost(T_predicted, tracks)
                 self._learn_orb_noise(estimate, len(measured.tracks))
+        is_jump = self._is_jump(hypothesis, estimate.T_world_camera, T_predicted)
+        in_sight = min(len(measured.tracks) + len(visible), len(view.features))
+        if is_jump and estimate.n_inliers < _RECOGNISED_SHARE * in_sight:
+            return self._lost(T_predicted, tracks)  # alike in some lines, not in what is between
         pixels = estimate.residuals_px[estimate.inliers][:, :2]
         return TrackedFrame(
             TrackingStatus.OK,
@@ -133,22 +164,39 @@ class Tracker:
             estimate.inliers,
             float(np.sqrt((pixels**2).sum(1).mean())) if len(pixels) else np.nan,
             visible,
+            is_jump,
         )
 
-    def _is_trusted(self, estimate: PoseEstimate, T_predicted: Array) -> bool:
+    def _is_trusted(
+        self, estimate: PoseEstimate, T_predicted: Array, hypothesis: MotionHypothesis
+    ) -> bool:
         """Whether enough points agree with a pose.
 
-        After a lost frame any place may be in sight, and places look alike: more must agree then,
-        unless the pose is about where the motion led.
+        After a lost frame, or where a view was recognised, any place may be in sight, and places
+        look alike: more must agree then, unless the pose is about where the motion led.
         """
-        assert self._last is not None and self.motion is not None
         share = self.config.min_inlier_share
-        if not self._last.flow_starts_here:
-            led_m = T_predicted[:3, 3] - self.motion.T_world_camera[:3, 3]
-            off_m = T_predicted[:3, 3] - estimate.T_world_camera[:3, 3]
-            if np.linalg.norm(off_m) > _REGAINED_NEAR * np.linalg.norm(led_m):
-                share = self.config.min_regained_share
+        lost_before = self._last is None or not self._last.flow_starts_here
+        T = estimate.T_world_camera
+        is_regained = lost_before and self._is_elsewhere(T, T_predicted)
+        if is_regained or self._is_jump(hypothesis, T, T_predicted):
+            share = self.config.min_regained_share
         return estimate.n_inliers >= max(self.config.min_inliers, share * len(estimate.inliers))
+
+    def _is_elsewhere(self, T: Array, T_predicted: Array, at_least_m: float = 0.0) -> bool:
+        """Whether a pose is far from where the motion since the last good frame led, if any did."""
+        assert self.motion is not None
+        if self._last is None:
+            return True
+        led_m = float(np.linalg.norm(T_predicted[:3, 3] - self.motion.T_world_camera[:3, 3]))
+        off_m = float(np.linalg.norm(T_predicted[:3, 3] - T[:3, 3]))
+        return off_m > max(_REGAINED_NEAR * led_m, at_least_m)
+
+    def _is_jump(self, hypothesis: MotionHypothesis, T: Array, T_predicted: Array) -> bool:
+        """Whether a place was recognised that is another one than where the motion led."""
+        least_m = _JUMP_BASELINES * self.camera.baseline_m
+        recognised = hypothesis is MotionHypothesis.RELOCALISATION
+        return recognised and self._is_elsewhere(T, T_predicted, least_m)
 
     def _lost(self, T_predicted: Array, tracks: Tracks) -> TrackedFrame:
         return TrackedFrame(
@@ -178,30 +226,35 @@ class Tracker:
 
         Constant velocity and PnP RANSAC compete always, as in the paper. Where the winner holds
         less than `weak_inlier_share` of the points, or too few in all, dense odometry and then a
-        search among recent keyframes try as well, each with measurements around its own guess.
-        Deviation: dense odometry costs too much to compete in every frame, as designed at first.
+        search among keyframes, recent or alike, try as well, each with measurements around its own
+        guess. Deviation: dense odometry costs too much to compete in every frame, as designed.
         """
         measured = self._measure(view, sparse_map, T_predicted)
         constant_velocity = MotionHypothesis.CONSTANT_VELOCITY
         name, T, n_inliers = self._compete(sparse_map, measured, constant_velocity, T_predicted)
-        fallbacks: tuple[tuple[MotionHypothesis, Callable[[], Array | None]], ...] = (
+        fallbacks: tuple[tuple[MotionHypothesis, Callable[[], _Guess | None]], ...] = (
             (MotionHypothesis.RGBD_ODOMETRY, lambda: self._dense_odometry(view, T_predicted)),
             (MotionHypothesis.RELOCALISATION, lambda: self._relocalise(view, sparse_map)),
         )
-        for rival, estimate in fallbacks:
+        for rival, make_guess in fallbacks:
             if not self._is_weak(n_inliers, len(measured.tracks)):
                 break
-            T_guess = estimate()
-            if T_guess is None:
+            guess = make_guess()
+            if guess is None:
                 continue
-            again = self._measure(view, sparse_map, T_guess)
-            _, T_again, n_again = self._compete(sparse_map, again, rival, T_guess)
+            again = self._measure(view, sparse_map, guess.T_world_camera)
+            _, T_again, n_again = self._compete(sparse_map, again, rival, guess.T_world_camera)
+            if guess.matches is not None and self._is_weak(n_again, len(again.tracks)):
+                # Far from the last frame, whose points are out of sight: those of the place itself
+                again = guess.matches
+                _, T_again, n_again = self._compete(sparse_map, again, rival, guess.T_world_camera)
             if n_again > n_inliers:  # whoever won: it did on measurements that the rival led to
                 name, T, n_inliers, measured = rival, T_again, n_again, again
         return name, T, measured
 
     def _measure(self, view: View, sparse_map: SparseMap, T: Array) -> Measurement:
-        assert self._last is not None
+        if self._last is None:
+            return Measurement(Tracks.empty(), {})
         return measure_points(self._last, view, sparse_map, T, self.sensor, self.config)
 
     def _is_weak(self, n_inliers: int, n_tracks: int) -> bool:
@@ -223,11 +276,10 @@ class Tracker:
         candidates = {name: T_world_camera, MotionHypothesis.PNP_RANSAC: pnp}
         return choose_hypothesis(self.camera, candidates, points, uv, limit)
 
-    def _dense_odometry(self, view: View, T_predicted: Array) -> Array | None:
+    def _dense_odometry(self, view: View, T_predicted: Array) -> _Guess | None:
         """T_world_camera (4, 4) by RGB-D odometry from the last view, seeded by prediction."""
-        if not self.config.use_rgbd_odometry:
+        if not self.config.use_rgbd_odometry or self._last is None:
             return None
-        assert self._last is not None
         assert self.motion is not None
         last = self._last.view
         T_prev_curr = estimate_rgbd_odometry(
@@ -237,14 +289,34 @@ class Tracker:
             invert_T(self.motion.T_world_camera) @ T_predicted,
             self.camera.bf / self.sensor.min_close_disparity_px,
         )
-        return None if T_prev_curr is None else self.motion.T_world_camera @ T_prev_curr
+        return None if T_prev_curr is None else _Guess(self.motion.T_world_camera @ T_prev_curr)
 
-    def _relocalise(self, view: View, sparse_map: SparseMap) -> Array | None:
-        """T_world_camera (4, 4) by descriptors alone, against points of the latest keyframes."""
-        recent = sparse_map.keyframes[-_RELOCALISE_AGAINST:]
-        if not recent:
+    def _relocalise(self, view: View, sparse_map: SparseMap) -> _Guess | None:
+        """Pose by descriptors alone, against the latest keyframes, then against places alike.
+
+        Of the places the one with which most points agree wins.
+        """
+        n = len(sparse_map.keyframes)
+        latest = range(max(0, n - _RELOCALISE_AGAINST), n)
+        found = self._recognise(view, sparse_map, latest)
+        if found is not None:
+            return found[0]
+        best: tuple[_Guess, int] | None = None
+        for row in self.seen_before(view.features.descriptors):
+            near = [row, *sparse_map.covisible_keyframes(row)[:_PLACE_NEIGHBOURS]]
+            found = self._recognise(view, sparse_map, near)
+            if found is not None and (best is None or found[1] > best[1]):
+                best = found
+        return None if best is None else best[0]
+
+    def _recognise(
+        self, view: View, sparse_map: SparseMap, rows: Sequence[int]
+    ) -> tuple[_Guess, int] | None:
+        """Pose by the points of some keyframes, and how many agree; None where too few do."""
+        if not rows:
             return None
-        ids = np.unique(np.concatenate([k.tracks.point_ids for k in recent]))
+        seen = [sparse_map.keyframes[row].tracks.point_ids for row in rows]
+        ids = np.unique(np.concatenate(seen))
         ids = ids[sparse_map.alive[ids]]
         points, features = match_all(
             sparse_map.descriptor[ids],
@@ -254,14 +326,19 @@ class Tracker:
         )
         if len(points) < self.config.min_inliers:
             return None
-        world, uv = sparse_map.position_m[ids[points]], view.features.uv_px[features]
+        ids, uv = ids[points], view.features.uv_px[features]
+        world = sparse_map.position_m[ids]
         limit = _RELOCALISE_SLACK * self.config.inlier_px
         T = estimate_pnp(self.camera, world, uv, limit, self.config.seed)
         if T is None:
             return None
-        n = reprojection_inliers(self.camera, T, world, uv, limit).sum()
-        enough = max(self.config.min_inliers, _RELOCALISED_SHARE * len(world))
-        return T if n >= enough else None
+        n_agree = int(reprojection_inliers(self.camera, T, world, uv, limit).sum())
+        if n_agree < max(self.config.min_inliers, _RELOCALISED_SHARE * len(world)):
+            return None
+        # Without disparities: a feature of a coarse level lies pixels off, on another depth
+        sigma = np.full(len(uv), self.noise.sigma_uv_px["orb"])
+        tracks = Tracks(ids, uv, np.full(len(uv), np.nan), sigma)
+        return _Guess(T, Measurement(tracks, {})), n_agree
 
     # ----------------------------------------------------------------- noise
 

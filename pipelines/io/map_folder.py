@@ -99,7 +99,7 @@ def save_map(
     Raises DyObError where the disk refuses or `folder` holds anything but a map.
     """
     folder = Path(folder)
-    _check_target(folder)
+    check_map_target(folder)
     objects = ObjectEstimates.empty() if objects is None else objects
     points, keyframes = point_arrays(sparse_map), keyframe_arrays(sparse_map)
     static = sparse_map.snapshot()
@@ -184,8 +184,11 @@ def read_map_head(folder: Path | str) -> dict[str, Any]:
     return head
 
 
-def _check_target(folder: Path) -> None:
-    """Only a map may be replaced: other folders may hold what is dear."""
+def check_map_target(folder: Path) -> None:
+    """Whether a map may be written there: only a map is replaced, other folders may be dear.
+
+    Raises DyObError, in a sentence, where it may not.
+    """
     if not folder.exists():
         return
     held = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else None

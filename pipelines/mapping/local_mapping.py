@@ -74,6 +74,20 @@ class LocalMapping:
         sparse_map.cull_points(tracks.point_ids, visible)
         return tracks[sparse_map.alive[tracks.point_ids]], is_keyframe
 
+    def localize(self, sparse_map: SparseMap, tracked: TrackedFrame) -> Tracks:
+        """The tracks that the next frame will follow where the map must stay as it is.
+
+        Only the disparity offset is learned: the map's points do not depend on this run's.
+        """
+        tracks = tracked.tracks[tracked.inliers]
+        if len(tracks) and self.sensor.calibrates_disparity:
+            sigma = self.sensor.noise.sigma_disparity_px
+            observations = sparse_map.observe(tracks, sigma)
+            still = np.zeros((len(tracks), 3))
+            self.sensor.offset.learn(self.camera, tracked.T_world_camera, observations, still)
+            self.sensor.offset.step()
+        return tracks
+
     def mappable_features(self, view: View, tracks: Tracks) -> NDArray[np.int64]:
         """Indices (N,) of features with some depth, away from the tracks; the strongest first."""
         features = view.features

@@ -190,6 +190,10 @@ class SparseMap:
         """Let points follow a change of the disparity offset, to first order."""
         self.position_m[ids] += step_px * self.offset_slope[ids]
 
+    def detach_offset(self) -> None:
+        """Let no point depend on the disparity offset: theirs was that of an earlier run."""
+        self.offset_slope[: self._size] = 0.0
+
     def record_sight(self, visible_ids: Ids, found_ids: Ids) -> None:
         """Count which points a frame should have seen, and which it did see."""
         self.n_visible[visible_ids] += 1

@@ -246,3 +246,32 @@ def test_dense_odometry_finds_a_step_whatever_the_far_limit():
     for max_depth_m in (10.0, 50.0, 312.0):
         T = estimate_rgbd_odometry(CAMERA, a, b, np.eye(4), max_depth_m)
         assert error_m_deg(path(2) @ T, path(3))[0] < 0.01, max_depth_m
+
+
+@pytest.mark.parametrize(("scrambled", "status"), [(0.0, "OK"), (0.7, "LOST")])
+def test_a_place_counts_as_recognised_where_most_points_agree(scrambled, status):
+    """Seven in ten points of the map lie elsewhere: dozens agree still, but too small a share."""
+    run = Run(use_rgbd_odometry=False).begin(path(0))
+    for k in range(1, 4):
+        run.track(path(k), k)
+    rng = np.random.default_rng(2)
+    ids = np.flatnonzero(run.map.alive)
+    wrong = rng.choice(ids, int(scrambled * len(ids)), replace=False)
+    run.map.position_m[wrong] = run.map.position_m[rng.permutation(wrong)]
+    assert len(ids) - len(wrong) > 100
+    asked = []
+
+    def seen_before(descriptors):
+        asked.append(descriptors.shape)
+        return [0]
+
+    lost = Tracker(run.sensor, run.tracker.config, seen_before)
+    view = run.view(path(1), 9)
+    lost.start(view, path(1) @ exp_se3(np.array([0.0, 0.5, 0.0, 0.0, 0.0, 3.0])))
+    tracked = lost.track(view, run.map)
+    assert tracked.status is TrackingStatus[status]
+    if status == "OK":
+        assert tracked.hypothesis is MotionHypothesis.RELOCALISATION
+        assert error_m_deg(tracked.T_world_camera, path(1))[0] < 0.02
+    else:
+        assert asked == [(len(view.features), 32)]
