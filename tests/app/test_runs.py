@@ -12,6 +12,7 @@ import pytest
 
 from app import cli, console, runs
 from pipelines.errors import ConfigError, DyObError
+from pipelines.lasting_map import LastingMap
 
 
 @pytest.fixture
@@ -23,7 +24,11 @@ def calls(monkeypatch, tmp_path) -> dict[str, Any]:
         seen["opened"] = (path, dataset, name, options)
         return "the sequence"
 
-    def run(sequence, config=None, output=None, *, sinks=(), **span):
+    def run(
+        sequence, config=None, output=None, *, sinks=(), batch_progress=None, lasting_map=None,
+        **span,
+    ):  # fmt: skip
+        seen["lasting_map"] = lasting_map
         seen.update(sequence=sequence, config=config, output=output, sinks=sinks, span=span)
         return SimpleNamespace(folder=tmp_path, metrics={"run": seen["counts"]}, timings={})
 
@@ -53,6 +58,7 @@ def test_flags_reach_the_run(calls) -> None:
     assert runs.run(words(f"{line} --set orb.n_features=900")) == 0
     assert calls["opened"] == ("data", "vdo", "a", {})
     assert calls["span"] == {"start": 2, "frames": 5, "stride": 3}
+    assert calls["lasting_map"] == LastingMap()
     assert calls["output"] == "out"
     assert calls["config"].orb.n_features == 900
     assert [type(sink).__name__ for sink in calls["sinks"]] == ["Progress", "FrameWriter"]
@@ -102,6 +108,13 @@ def test_an_interrupted_run_ends_with_130(calls, line) -> None:
     verb = runs.demo if line == "demo" else runs.run
     assert verb(words(line)) == 130
     assert "rendered" not in calls
+
+
+def test_map_folders_reach_the_run(calls) -> None:
+    assert runs.run(words("run data --load-map old --localize")) == 0
+    assert calls["lasting_map"] == LastingMap("old", None, localize=True)
+    assert runs.run(words("run data --load-map old --save-map new")) == 0
+    assert calls["lasting_map"] == LastingMap("old", "new")
 
 
 def test_a_run_that_tracked_nothing_is_an_error(calls) -> None:
