@@ -44,6 +44,38 @@ def replacing(path: Path | str, *, sync: bool = True) -> Iterator[Path]:
         fresh.unlink(missing_ok=True)
 
 
+@contextmanager
+def replacing_folder(folder: Path | str) -> Iterator[Path]:
+    """A fresh folder beside `folder` to fill; it takes its place when the block succeeds.
+
+    Whoever looks finds the old folder or the new one, whole. If the block fails, the old one stays.
+    Raises DyObError where the disk refuses.
+    """
+    folder = Path(folder).resolve()  # a link stays a link
+    mark = uuid.uuid4().hex[:8]
+    fresh, old = (folder.with_name(f".{folder.name}.{mark}.{word}") for word in ("new", "old"))
+    try:
+        fresh.mkdir(parents=True)
+        yield fresh
+        for path in fresh.iterdir():
+            with path.open("rb+") as file:
+                os.fsync(file.fileno())
+        if folder.exists():
+            folder.rename(old)
+        try:
+            fresh.rename(folder)
+        except OSError:
+            if old.exists():
+                old.rename(folder)
+            raise
+    except OSError as error:
+        raise DyObError(disk_error(folder, error)) from error
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+        if folder.exists():
+            shutil.rmtree(old, ignore_errors=True)
+
+
 def disk_error(path: Path, error: OSError) -> str:
     """The sentence for a file that could not be written."""
     try:

@@ -6,6 +6,8 @@ nothing itself; `point_filter` and `triangulation` hold the formulas.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +21,7 @@ from pipelines.geometry import (
 )
 from pipelines.mapping.keyframe import Keyframe
 from pipelines.observations import StereoObservations, Tracks
-from pipelines.types import Array, StaticMap, StereoCamera
+from pipelines.types import Array, StaticMap, StereoCamera, check_shape
 
 Ids = NDArray[np.int64]
 
@@ -71,6 +73,58 @@ class SparseMap:
         self._keyframe_Ts = np.empty((0, 4, 4))
         for name, (shape, dtype) in _COLUMNS.items():
             setattr(self, name, np.zeros((_FIRST_CAPACITY, *shape), dtype))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        camera: StereoCamera,
+        config: MappingConfig,
+        columns: Mapping[str, NDArray],
+        keyframes: Sequence[Keyframe],
+        covisible: Sequence[tuple[Ids, Ids]],
+    ) -> SparseMap:
+        """A map as another one's `columns`, `keyframes` and `covisibility` tell; nothing is shared.
+
+        Points that no keyframe has seen are young again. Raises ValueError, naming the first, where
+        arrays do not fit each other or name points or keyframes that are not there.
+        """
+        sparse_map = cls(camera, config)
+        size = sparse_map._size = len(columns["alive"])
+        for name, (shape, dtype) in _COLUMNS.items():
+            check_shape("SparseMap", name, columns[name], (size, *shape))
+            column: NDArray = np.zeros((max(size, _FIRST_CAPACITY), *shape), dtype)
+            column[:size] = columns[name]
+            setattr(sparse_map, name, column)
+        _check_ids("first_keyframe", sparse_map.first_keyframe[:size], (-1, len(keyframes)))
+        for keyframe in keyframes:
+            _check_ids("point_ids", keyframe.tracks.point_ids, (0, size))
+        for others, n_shared in covisible:
+            check_shape("SparseMap", "n_shared", n_shared, others.shape)
+            _check_ids("covisible", others, (0, len(keyframes)))
+        if len(covisible) != len(keyframes):
+            raise ValueError(f"SparseMap.covisible: {len(covisible)} of {len(keyframes)} keyframes")
+        unseen = sparse_map.n_keyframes[:size] == 0
+        sparse_map._free = np.flatnonzero(unseen & ~sparse_map.alive[:size])
+        sparse_map._young = np.flatnonzero(unseen & sparse_map.alive[:size])
+        sparse_map.keyframes = list(keyframes)
+        sparse_map._keyframe_Ts = np.array([k.T_world_camera for k in keyframes]).reshape(-1, 4, 4)
+        sparse_map._covisible = [others.astype(np.int64) for others, _ in covisible]
+        sparse_map._n_shared = [n_shared.astype(np.int64) for _, n_shared in covisible]
+        return sparse_map
+
+    def columns(self) -> dict[str, NDArray]:
+        """Read-only views of all columns of points by name; a point's id is its row, dead or not.
+
+        position_m and the others are as in `_COLUMNS`, each (N, ...) without spare capacity.
+        """
+        views = {name: getattr(self, name)[: self._size] for name in _COLUMNS}
+        for view in views.values():
+            view.flags.writeable = False
+        return views
+
+    def covisibility(self) -> list[tuple[Ids, Ids]]:
+        """Per keyframe, the covisible ones, most shared first, and how many points each shares."""
+        return list(zip(self._covisible, self._n_shared, strict=True))
 
     # ---------------------------------------------------------------- points
 
@@ -247,4 +301,14 @@ class SparseMap:
             self.n_found[ids].copy(),
             self._keyframe_Ts.copy(),
             np.array([k.frame_index for k in self.keyframes], np.int64),
+        )
+
+
+def _check_ids(name: str, ids: NDArray, limits: tuple[int, int]) -> None:
+    """Raise ValueError where an id lies outside [first, stop)."""
+    first, stop = limits
+    if len(ids) and not (first <= ids.min() and ids.max() < stop):
+        raise ValueError(
+            f"SparseMap.{name}: expected ids from {first} to {stop - 1}, "
+            f"found {ids.min()} to {ids.max()}"
         )

@@ -1,4 +1,4 @@
-"""What stands along the way of a replayed KITTI sequence: houses, trees and street furniture.
+"""What stands along a way through a town or a replayed KITTI sequence: houses, trees, furniture.
 
 Owns where they stand: along the ego path, and never where anything of the sequence ever is. A
 closed row of houses round everything leaves no open horizon.
@@ -43,10 +43,10 @@ class Surroundings:
         self._heading = np.arctan2(step[:, 0], step[:, 1])
         self._houses: list[Array] = []
 
-    def build(self) -> list[Mesh]:
-        """Houses first, then what fits before and between them."""
+    def build(self, rows: int = len(_ROWS)) -> list[Mesh]:
+        """Houses first, of which `rows` along the path, then what fits before and between them."""
         self._border()
-        for row in range(len(_ROWS)):
+        for row in range(rows):
             for side in (-1, 1):
                 self._terrace(side, row)
         for side in (-1, 1):
@@ -54,6 +54,20 @@ class Surroundings:
         self._meadow()
         self._centre_line()
         return self.parts
+
+    def line(self, start: Array, heading: float, length_m: float, front_m: float) -> None:
+        """Houses wall to wall on both sides of a straight street, wherever one stands free.
+
+        start: (2,) where the middle of the street begins. front_m: from there to the fronts.
+        """
+        forward = np.array([np.sin(heading), np.cos(heading)])
+        for side in (-1, 1):
+            s = 0.0
+            while s < length_m:
+                width = float(self._rng.uniform(8.5, 13.5))
+                place = start + (s + width / 2) * forward
+                placed = self._place_house(place, heading, side * front_m, width, False)
+                s += width if placed else 1.0
 
     def _border(self) -> None:
         """A closed row of houses just inside the edge of the ground, fronts inward."""
@@ -85,14 +99,17 @@ class Surroundings:
             s += width
             for lateral in _ROWS[row]:
                 wider = 3.3 if side < 0 else 0.0  # the oncoming lane is on the left
-                if self._place_house(k, side * (lateral + wider), width, plain=row > 0):
+                place, heading = self._path[k], float(self._heading[k])
+                if self._place_house(place, heading, side * (lateral + wider), width, row > 0):
                     break
 
-    def _place_house(self, k: int, lateral: float, width: float, plain: bool) -> bool:
-        heading, side = float(self._heading[k]), float(np.sign(lateral))
+    def _place_house(
+        self, place: Array, heading: float, lateral: float, width: float, plain: bool
+    ) -> bool:
+        side = float(np.sign(lateral))
         right = np.array([np.cos(heading), -np.sin(heading)])
         forward = np.array([np.sin(heading), np.cos(heading)])
-        front = self._path[k] + lateral * right
+        front = place + lateral * right
         centre = front + side * right * _HOUSE_DEPTH_M / 2
         plan = outline(centre[0], centre[1], np.array(heading), _HOUSE_DEPTH_M, width)
         if not self._is_free(plan, heading):

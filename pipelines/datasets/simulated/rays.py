@@ -6,7 +6,7 @@ rays that are moved, and only those through the window of pixels that its box co
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,17 @@ class PlacedBody:
         if self._view is None:  # made late: many bodies turn out to be hidden
             self._view = ViewTable.of(self.body.table, self.origin, self.rays)
         return self._view
+
+    def narrowed(self, triangle: NDArray[np.int32]) -> tuple[PlacedBody, NDArray[np.int32]]:
+        """The body with the rows of `triangle` (N,) only, and these by their new numbers (N,).
+
+        Only a few thousand triangles of a town are seen at once: the others need no view.
+        """
+        seen = np.zeros(len(self.body.table), bool)
+        seen[triangle] = True
+        number = np.cumsum(seen, dtype=np.int32) - 1
+        body = replace(self.body, table=self.body.table.rows(np.flatnonzero(seen)))
+        return replace(self, body=body, _view=None), number[triangle]
 
     def points(self, u: Floats, v: Floats, t: Floats) -> Floats:
         """Points (3, N) in the body's frame, at `t` along the rays of pixels."""

@@ -6,7 +6,7 @@ with the ray p = o + t d, d = d0 + u du + v dv, a triangle's texture coordinates
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +60,14 @@ class TriangleTable:
             mesh.normals.astype(np.float32),
             np.stack([b1, b2], 1).astype(np.float32),
         )
+
+    def __len__(self) -> int:
+        return len(self.normal)
+
+    def rows(self, which: NDArray[np.int64]) -> TriangleTable:
+        """The table of some triangles only, in that order."""
+        own = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name != "tint"}
+        return TriangleTable(**own, tint=self.tint[:, which])
 
     def smooth_normals(self, triangle: NDArray[np.int32], points: Floats) -> Floats:
         """Unit normals (N, 3) between the corner normals, at points (3, N) on triangles (N,)."""

@@ -61,6 +61,18 @@ def _crossing(frames: int, seed: int, camera: StereoCamera) -> World:
     return make_crossing(frames, seed, camera)
 
 
+def _loop(frames: int, seed: int, camera: StereoCamera) -> World:
+    from pipelines.datasets.simulated.town import make_loop
+
+    return make_loop(frames, seed, camera)
+
+
+def _long(frames: int, seed: int, camera: StereoCamera) -> World:
+    from pipelines.datasets.simulated.town import make_long
+
+    return make_long(frames, seed, camera)
+
+
 def _static(frames: int, seed: int, camera: StereoCamera) -> World:
     from pipelines.datasets.simulated.street import make_street
 
@@ -79,6 +91,8 @@ SCENES: dict[str, Scene] = {
         Scene("street", _KITTI, 100, 10.0, _street),
         Scene("room", _RGBD, 100, 20.0, _room, indoors=True),
         Scene("crossing", _KITTI, 100, 10.0, _crossing),
+        Scene("loop", _KITTI, 520, 10.0, _loop),
+        Scene("long", scaled_camera(_KITTI, 0.4), 2000, 10.0, _long),
         Scene("static", _KITTI, 100, 10.0, _static),
         Scene("demo", scaled_camera(_KITTI, 0.5), 40, 10.0, _street),
     )

@@ -51,9 +51,9 @@ class SimulatedSequence(Sequence):
     dataset = "simulated"
     layout = (
         "no folder: a scene that the project renders itself, written simulated:NAME with NAME one "
-        "of street, crossing, room, static, demo or kitti_0000 to kitti_0020, and kept under "
-        ".cache/simulated or $DYOB_CACHE/simulated; kitti_NNNN replays the ego path and traffic of "
-        "KITTI tracking from your own label_02/NNNN.txt, calib/NNNN.txt and "
+        "of street, crossing, loop, long, room, static, demo or kitti_0000 to kitti_0020, and kept "
+        "under .cache/simulated or $DYOB_CACHE/simulated; kitti_NNNN replays the ego path and "
+        "traffic of KITTI tracking from your own label_02/NNNN.txt, calib/NNNN.txt and "
         "orbslam3_poses/NNNN/CameraTrajectory.txt in the folder that $DYOB_KITTI_TRACKING names"
     )
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from pipelines.geometry import make_T
 from pipelines.types import Array
 
 _CHUNK = 1 << 16  # samples that one thread shades at a time
+_MANY_TRIANGLES = 200_000  # of the still world, above which only those seen are looked at
 _TAPS = 4  # look-ups of the atlas along the long side of a pixel's footprint
 _HAZE_RGB = (204.0, 214.0, 222.0)
 _PATCH_REACH_M = 60.0  # shadow patches farther away than this are too small to see
@@ -43,6 +45,10 @@ class Shading:
         colour = np.empty((3, len(samples.u)), np.float32)
         world = placed[0]
         still = np.flatnonzero((samples.owner == 0) & (samples.triangle >= 0))
+        if len(world.body.table) > _MANY_TRIANGLES:
+            triangle = samples.triangle.copy()
+            world, triangle[still] = world.narrowed(triangle[still])
+            samples = replace(samples, triangle=triangle)
         points = world.points(samples.u[still], samples.v[still], samples.t[still])
         lamp = self._shadow.lit(points)
         around = np.ones_like(lamp)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.datasets.simulated.buildings import (
     bench,
@@ -25,7 +26,7 @@ from pipelines.datasets.simulated.buildings import (
 from pipelines.datasets.simulated.facades import FACADES
 from pipelines.datasets.simulated.meshes import WHITE, Mesh, box, merge, pose, surface
 from pipelines.datasets.simulated.people import WARDROBE, walker_mesh
-from pipelines.datasets.simulated.road import BLOCK_M, Road
+from pipelines.datasets.simulated.road import BLOCK_M, Curve, Road
 from pipelines.datasets.simulated.textures import SURFACES
 from pipelines.datasets.simulated.vehicles import SHAPES, VEHICLE_ART, car_mesh
 from pipelines.datasets.simulated.world import Actor, Light, World
@@ -70,7 +71,7 @@ def make_street(
         fps,
         street_static(road, rng),
         tuple(script.actors),
-        _camera_path(road, times),
+        camera_poses(road, ego, 0.1 * np.sin(0.5 * times), times),
         DAYLIGHT,
         SURFACES | FACADES | VEHICLE_ART,
         sky="sky",
@@ -87,9 +88,12 @@ def _ego_time(s: float) -> float:
     return float(np.interp(s, _ego_s(t), t))
 
 
-def _camera_path(road: Road, t: Array) -> Array:
-    """Poses (N + 1, 4, 4) of the left camera, with the slight pitch and bounce of a real car."""
-    x, z, psi = road.at(_ego_s(t), 0.1 * np.sin(0.5 * t))
+def camera_poses(road: Curve, s: Array, lateral: Array, t: Array) -> Array:
+    """Poses (N + 1, 4, 4) of the left camera, with the slight pitch and bounce of a real car.
+
+    s, lateral: (N + 1,) where on the road it is after `t` seconds.
+    """
+    x, z, psi = road.at(s, lateral)
     pitch = 0.004 * np.sin(5.3 * t) + 0.0025 * np.sin(11.0 * t + 1)
     roll = 0.004 * np.sin(3.1 * t + 0.5)
     lift = 0.015 * np.sin(6.1 * t) + 0.006 * np.sin(13.0 * t)
@@ -104,27 +108,32 @@ def _camera_path(road: Road, t: Array) -> Array:
 class StreetScript:
     """Collects the actors of the street, with their poses at all times."""
 
-    def __init__(self, road: Road, times: Array, rng: np.random.Generator) -> None:
+    def __init__(self, road: Curve, times: Array, rng: np.random.Generator) -> None:
         self.road, self.times, self.rng = road, times, rng
         self.actors: list[Actor] = []
         self._shapes = {kind: car_mesh(kind) for kind in SHAPES}
         self._walkers = [walker_mesh(clothes) for clothes in WARDROBE]
 
-    def car(self, Ts: Array, moving: bool, kind: str = "") -> None:
-        """Add a car on the road at `Ts`, of a random kind unless told; its height is set here."""
+    def car(
+        self, Ts: Array, moving: bool, kind: str = "", present: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Add a car on the road at `Ts`, of a random kind unless told; its height is set here.
+
+        present: (N + 1,) frames in which it is there at all, None for always.
+        """
         kind = kind or str(self.rng.choice(list(SHAPES), p=(0.32, 0.32, 0.24, 0.12)))
         mesh = self._shapes[kind].painted_as(CAR_PAINTS[self.rng.integers(0, len(CAR_PAINTS))])
         Ts = Ts.copy()
         Ts[:, 1, 3] = -SHAPES[kind].size_m[1] / 2
-        self.actors.append(Actor(len(self.actors) + 1, "car", mesh, Ts, moving))
+        self.actors.append(Actor(len(self.actors) + 1, "car", mesh, Ts, moving, present))
 
-    def walker(self, Ts: Array) -> None:
-        """Add a person whose soles are at `Ts`."""
+    def walker(self, Ts: Array, present: NDArray[np.bool_] | None = None) -> None:
+        """Add a person whose soles are at `Ts`; `present` as of `car`."""
         mesh = self._walkers[self.rng.integers(0, len(self._walkers))]
         _, high = mesh.bounds()
         Ts = Ts.copy()
         Ts[:, 1, 3] -= high[1]
-        self.actors.append(Actor(len(self.actors) + 1, "person", mesh, Ts, True))
+        self.actors.append(Actor(len(self.actors) + 1, "person", mesh, Ts, True, present))
 
     def follow(self, s: Array, lateral: Along, direction: int = 1, y: float = 0.0) -> Array:
         """Poses of something that drives or walks along `lateral(s)`, facing its way."""
