@@ -7,6 +7,7 @@ nothing itself; `point_filter` and `triangulation` hold the formulas.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -282,6 +283,32 @@ class SparseMap:
         uv = project_stereo(self.camera, points)[:, :2]
         inside = inside_image(self.camera, uv)
         return ids[inside], uv[inside]
+
+    # ----------------------------------------------------------- corrections
+
+    def move_keyframe(self, index: int, T_world_camera: Array) -> None:
+        """Put a keyframe elsewhere; its points stay."""
+        self.keyframes[index] = replace(self.keyframes[index], T_world_camera=T_world_camera)
+        self._keyframe_Ts[index] = T_world_camera
+
+    def move_points(self, Cs: Array, ids: Ids, shifts_m: Array) -> None:
+        """Move each point by the motion of its first keyframe, but named ones by their own shifts.
+
+        Cs: (K, 4, 4) p_new = C @ p_old, of all keyframes; points that no keyframe has seen yet go
+        with the last. ids: (N,) of the points with shifts (N, 3) in m.
+        """
+        first = self.first_keyframe[: self._size]
+        changed = np.abs(Cs - np.eye(4)).max(axis=(1, 2)) > 0
+        rows = np.flatnonzero(self.alive[: self._size] & changed[first])
+        named = np.zeros(self._size, bool)
+        named[ids] = True
+        by = first[rows]
+        R, t = Cs[by, :3, :3], Cs[by, :3, 3]
+        position = np.einsum("nij,nj->ni", R, self.position_m[rows]) + t
+        self.position_m[rows] = np.where(named[rows, None], self.position_m[rows], position)
+        self.position_m[ids] += shifts_m
+        self.covariance_m2[rows] = R @ self.covariance_m2[rows] @ R.transpose(0, 2, 1)
+        self.offset_slope[rows] = np.einsum("nij,nj->ni", R, self.offset_slope[rows])
 
     # --------------------------------------------------------------- outside
 
