@@ -36,6 +36,8 @@ def _runs(name):
 
 def main(argv):
     """Run the command line; the exit code."""
+    # Matrices here are small: threads of BLAS would only spin beside the two of a run
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from app import cli
     from pipelines.errors import DyObError
 

@@ -51,6 +51,14 @@ run DATA --set orb.n_features=1500 --output my_result""",
 eval                            # the latest result
 eval RESULT""",
     ),
+    "optimize": Verb(
+        "app.runs:optimize",
+        "optimise a result folder: cameras, map and objects of the whole run at once",
+        """\
+optimize                        # the latest result
+optimize RESULT --set batch.acceleration_mps2=0.5
+optimize RESULT --set batch.method=partial""",
+    ),
     "render": Verb(
         "app.runs:render",
         "draw a result folder's map and trajectory, without a display",
@@ -166,6 +174,7 @@ def build_parser() -> argparse.ArgumentParser:
         "demo": _add_demo,
         "run": _add_run,
         "eval": _add_result,
+        "optimize": _add_optimize,
         "render": _add_render,
         "prepare": _add_prepare,
         "doctor": _add_doctor,
@@ -249,6 +258,12 @@ def _add_result(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "result", metavar="RESULT", nargs="?", default=LATEST, help=f"default: {LATEST}"
     )
+
+
+def _add_optimize(parser: argparse.ArgumentParser) -> None:
+    _add_result(parser)
+    _add_settings(parser)
+    parser.add_argument("--quiet", action="store_true", help="no progress bar and no table")
 
 
 def _add_render(parser: argparse.ArgumentParser) -> None:

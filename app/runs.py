@@ -87,6 +87,26 @@ def evaluate(arguments: Namespace) -> int:
     return 0
 
 
+def optimize(arguments: Namespace) -> int:
+    """`optimize RESULT`: the batch, from what the run recorded; a table of before and after."""
+    from pipelines.config import load_config
+    from pipelines.io.folder import open_result_folder
+    from pipelines.io.result import load_result
+    from pipelines.optimisation import optimise_result
+
+    folder = open_result_folder(arguments.result)
+    own = folder / "config.yaml"
+    path = arguments.config or (own if own.exists() else None)
+    config = load_config(path, arguments.overrides)
+    counting = console.counting("optimising", arguments.quiet)
+    with console.warnings(), counting as progress:
+        metrics = optimise_result(folder, config.batch, progress)
+    if not arguments.quiet:
+        result = load_result(folder)
+        console.metrics(metrics, result.timings, console.shorten(folder))
+    return 0
+
+
 def render(arguments: Namespace) -> int:
     """`render RESULT`: PNG files in the result folder."""
     from pipelines.io.folder import open_result_folder
@@ -125,8 +145,10 @@ def _process(sequence: Any, config: Any, arguments: Namespace, span: dict[str, A
     sinks: list[Any] = [] if arguments.quiet else [console.Progress()]
     if arguments.pictures:
         sinks.append(FrameWriter(every=arguments.pictures))
-    with console.warnings():
-        result = run_sequence(sequence, config, arguments.output, **span, sinks=sinks)
+    with console.warnings(), console.counting("optimising", arguments.quiet) as optimising:
+        result = run_sequence(
+            sequence, config, arguments.output, **span, sinks=sinks, batch_progress=optimising
+        )
     if not arguments.quiet:
         console.metrics(result.metrics, result.timings, console.shorten(result.folder))
     return result

@@ -261,6 +261,34 @@ class PlacesConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class BatchConfig:
+    """Step 12: the batches that optimise what has been seen so far, or all of a run."""
+
+    at_end: bool = True  # the global batch runs when a run is over; `optimize` does it again
+    record: bool = True  # keep what every frame saw in the result folder, for `optimize`
+    objects: bool = True  # false: cameras and static points alone
+    rounds: int = 2  # solutions, each without the outliers of the one before
+    max_steps: int = 5  # of Levenberg-Marquardt in a round
+    acceleration_mps2: float = 1.0  # m/s^2, standard deviation of the change of a speed
+    turn_radps2: float = 0.2  # rad/s^2, and of the change of a turn
+    planar_sigma: float = 0.0  # tilt and lift of road vehicles as a share of their way, 0 = free
+    held_out_share: float = 0.1  # of the sightings, which judge whether the batch is believed
+    max_static_per_frame: int = 0  # static points of a frame, the longest tracks first, 0 = all
+    covariances: bool = True  # standard deviations of the final poses
+    # partial: cameras and static points alone, in windows
+    method: Literal["global", "partial"] = "global"
+    partial_window: int = 20  # frames of a window of the partial batch (paper)
+    partial_overlap: int = 4  # frames that a window shares with the one before (paper)
+
+    def __post_init__(self) -> None:
+        _check(self, rounds=(1, 10), max_steps=(1, 100))
+        _check(self, acceleration_mps2=(1e-3, _ANY), turn_radps2=(1e-3, _ANY))
+        _check(self, planar_sigma=(0, 1), held_out_share=(0.01, 0.5))
+        _check(self, max_static_per_frame=(0, _ANY))
+        _check(self, partial_window=(4, 1000), partial_overlap=(1, 1000))
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """The whole system's settings."""
 
@@ -273,6 +301,7 @@ class Config:
     mapping: MappingConfig = field(default_factory=MappingConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     places: PlacesConfig = field(default_factory=PlacesConfig)
+    batch: BatchConfig = field(default_factory=BatchConfig)
 
 
 def load_config(path: str | Path | None = None, overrides: Iterable[str] = ()) -> Config:

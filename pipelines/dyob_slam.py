@@ -20,11 +20,13 @@ from pipelines.depth import StereoDepth
 from pipelines.detection.geometry import MultiViewGeometry
 from pipelines.detection.geometry_view import GeometryView
 from pipelines.errors import FrameError
+from pipelines.frame_observations import FrameObservations, Sightings
 from pipelines.frontend.orb import OrbExtractor
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame, Tracker
 from pipelines.frontend.view import PreparedFrame, View, complete_view, prepare_frame
 from pipelines.mapping.local_mapping import LocalMapping
+from pipelines.mapping.sightings import static_sightings
 from pipelines.mapping.sparse_map import SparseMap
 from pipelines.object_types import ObjectEstimates
 from pipelines.objects.frame import ObjectFrame
@@ -66,6 +68,7 @@ class DyObSlam:
         self._geometry = MultiViewGeometry(camera, self.config.geometry)
         self._landmarks: set[int] = set()
         self._lost_frames = 0
+        self._static_tracks = Tracks.empty()  # of the last frame
         self._timings_ms: dict[str, float] = {}
 
     def process(self, frame: Frame | PreparedFrame) -> FrameResult:
@@ -99,8 +102,10 @@ class DyObSlam:
             is_keyframe = self._grow_map(view, tracked)
             if is_keyframe:
                 self._geometry.add_keyframe()
+            seen = self._observations(view, tracked)
         self._timings_ms["total"] = sum(self._timings_ms.values())
-        return self._result(prepared.frame, tracked, is_keyframe, estimates, objects)
+        result = self._result(prepared.frame, tracked, is_keyframe, estimates, objects)
+        return replace(result, observations=seen)
 
     def prepare(self, frame: Frame) -> PreparedFrame:
         """The part of a frame's work that needs images alone; it may run ahead of `process`.
@@ -266,12 +271,26 @@ class DyObSlam:
     def _grow_map(self, view: View, tracked: TrackedFrame) -> bool:
         """Whether the frame became a keyframe; LOST ones leave the map alone."""
         if tracked.status is not TrackingStatus.OK:
+            self._static_tracks = Tracks.empty()
             return False
         tracks, is_keyframe = self._mapping.integrate(self.map, view, tracked)
         self._tracker.remember(view, tracks)
+        self._static_tracks = tracks
         return is_keyframe
 
     # ---------------------------------------------------------------- answers
+
+    def _observations(self, view: View, tracked: TrackedFrame) -> FrameObservations:
+        """What this frame saw, for the batch."""
+        T, sigma = tracked.T_world_camera, self.sensor.noise.sigma_disparity_px
+        static = static_sightings(self.map, self._static_tracks, view.frame_index, T, sigma)
+        return FrameObservations(
+            view.frame_index,
+            view.timestamp_s,
+            tracked.status is TrackingStatus.OK,
+            T,
+            Sightings.concatenate(static, self._objects.sightings),
+        )
 
     def _result(
         self,

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.types import Array, StereoCamera
 
+_I = np.eye(3)
 MIN_DEPTH_M = 0.05  # a point nearer than this, or behind the camera, cannot be observed
 
 
@@ -22,7 +23,7 @@ def invert_T(T: Array) -> Array:
     R = np.swapaxes(T[..., :3, :3], -1, -2)
     inverse = np.zeros_like(T)
     inverse[..., :3, :3] = R
-    inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", R, T[..., :3, 3])
+    inverse[..., :3, 3] = -(R @ T[..., :3, 3:])[..., 0]
     inverse[..., 3, 3] = 1.0
     return inverse
 
@@ -51,18 +52,16 @@ def skew(v: Array) -> Array:
 def exp_se3(xi: Array) -> Array:
     """Rigid motions (..., 4, 4) of twists (..., 6) [omega rad, v m]."""
     omega, v = xi[..., :3], xi[..., 3:]
-    theta2 = np.einsum("...i,...i->...", omega, omega)
-    small = theta2 < 1e-16
-    theta2 = np.where(small, 1.0, theta2)
+    theta2 = np.maximum((omega * omega).sum(-1), 1e-16)[..., None, None]  # keeps divisors off 0
     theta = np.sqrt(theta2)
-    A = np.where(small, 1.0, np.sin(theta) / theta)[..., None, None]
-    B = np.where(small, 0.5, (1.0 - np.cos(theta)) / theta2)[..., None, None]
-    C = np.where(small, 1.0 / 6.0, (1.0 - np.sin(theta) / theta) / theta2)[..., None, None]
+    A = np.sin(theta) / theta
+    B = 0.5 * (np.sin(0.5 * theta) / (0.5 * theta)) ** 2  # (1 - cos) / theta^2, for small ones too
+    C = (1.0 - A) / theta2
     W = skew(omega)
     W2 = W @ W
     T = np.zeros((*xi.shape[:-1], 4, 4))
-    T[..., :3, :3] = np.eye(3) + A * W + B * W2
-    T[..., :3, 3] = ((np.eye(3) + B * W + C * W2) @ v[..., None])[..., 0]
+    T[..., :3, :3] = _I + A * W + B * W2
+    T[..., :3, 3] = ((_I + B * W + C * W2) @ v[..., None])[..., 0]
     T[..., 3, 3] = 1.0
     return T
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,10 +17,12 @@ from typing import Protocol
 from pipelines.config import Config, config_to_dict
 from pipelines.datasets.sequence import Sequence
 from pipelines.dyob_slam import DyObSlam
-from pipelines.errors import DatasetError, FrameError
+from pipelines.errors import DatasetError, DyObError, FrameError
 from pipelines.evaluation import evaluate_result
 from pipelines.frontend.view import PreparedFrame
+from pipelines.io import folder as names
 from pipelines.io.folder import clear_result_folder
+from pipelines.io.observations import ObservationRecorder
 from pipelines.io.result import (
     Result,
     ResultWriter,
@@ -54,6 +56,7 @@ class _Progress:
     results: list[FrameResult] = field(default_factory=list)
     skipped: int = 0
     interrupted: bool = False
+    recorder: ObservationRecorder | None = None
 
 
 def run(
@@ -65,11 +68,13 @@ def run(
     frames: int | None = None,
     stride: int = 1,
     sinks: Iterable[Sink] = (),
+    batch_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Result:
     """Run the whole system on a sequence and return its result folder, read back.
 
     output: the folder to write; by default a new one under `results`, with a `latest` link.
-    start, frames, stride: which frames to take, all by default. A frame that cannot be read is
+    start, frames, stride: which frames to take, all by default. batch_progress: called with (done,
+    total) while the batch at the end runs. A frame that cannot be read is
     skipped with a warning. Ctrl-C ends the run early with a valid, partial result. Raises
     DatasetError where no frame is asked for or none can be read.
     """
@@ -81,6 +86,8 @@ def run(
     writer.write_config(config_to_dict(config))
     slam = DyObSlam(sequence.camera, config)
     progress = _Progress()
+    if config.batch.record or config.batch.at_end:
+        progress.recorder = ObservationRecorder(folder / names.OBSERVATIONS, sequence.camera)
     sinks = tuple(sinks)
     with writer.log_to_file():
         _log.info("%s (%s), %d frames", sequence.name, sequence.dataset, len(indices))
@@ -107,7 +114,23 @@ def run(
         except KeyboardInterrupt:  # once more, in peace; a second Ctrl-C ends it
             _note_interruption(progress)
             _write(writer, sequence, slam, progress)
+        if config.batch.at_end and progress.results and not progress.interrupted:
+            _optimise(folder, config, batch_progress)
+        if progress.recorder is not None and not config.batch.record:
+            progress.recorder.remove()
     return load_result(folder)
+
+
+def _optimise(folder: Path, config: Config, batch_progress: Callable[[int, int], None]) -> None:
+    """The global batch at the end; whatever becomes of it, the front-end's result is there."""
+    from pipelines.optimisation import optimise_result
+
+    try:
+        optimise_result(folder, config.batch, batch_progress)
+    except KeyboardInterrupt:
+        _log.warning("batch stopped: the result is the front-end's")
+    except (DyObError, RuntimeError, MemoryError) as error:  # gtsam's own are RuntimeErrors
+        _log.warning("no batch: %s; the result is the front-end's", error)
 
 
 def _note_interruption(progress: _Progress) -> None:
@@ -145,7 +168,10 @@ def _process_all(
         end = time.perf_counter()
         result.timings_ms["wall"] = 1e3 * (end - begin)
         begin = end
-        progress.results.append(replace(result, object_labels=None))  # a megabyte a frame
+        if progress.recorder is not None and result.observations is not None:
+            progress.recorder.add(result.observations)
+        # Labels are a megabyte a frame, observations a tenth of it
+        progress.results.append(replace(result, object_labels=None, observations=None))
         _log.info(
             "frame %d %s by %s, %d inliers of %d%s, %.1f ms",
             index,
@@ -181,6 +207,8 @@ def _write(writer: ResultWriter, sequence: Sequence, slam: DyObSlam, progress: _
     """All files: first what was estimated; the truth, which may be damaged, costs only errors."""
     static_map = slam.static_map()
     writer.write_run(progress.results, static_map)
+    if progress.recorder is not None:
+        progress.recorder.finish(static_map.track_ids)
     metrics = {
         "run": run_metrics(
             progress.results,

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.frame_observations import FrameObservations
 from pipelines.object_types import ObjectEstimates
 from pipelines.shapes import check_shape
 
@@ -233,6 +234,7 @@ class FrameResult:
     reprojection_rmse_px: of the inliers' pixels (u_L, v), NaN where there are none.
     objects: rows of all objects that are being tracked. object_labels: (H, W) int32, pixels of each
         by its lasting id, 0 elsewhere; None where there are no objects.
+    observations: what the batch will want to know of this frame.
     timings_ms: time of each stage of this frame; "total", their sum; in a run also "wall", the time
         since the result before this one, which is less as frames are prepared ahead.
     """
@@ -251,6 +253,7 @@ class FrameResult:
     objects: ObjectEstimates = field(default_factory=ObjectEstimates.empty)
     object_labels: NDArray[np.int32] | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
+    observations: FrameObservations | None = None
 
     def __post_init__(self) -> None:
         N = len(self.keypoints_px)
@@ -267,7 +270,7 @@ class StaticMap:
 
     points_m: (N, 3) in the world. colors: (N, 3) uint8 RGB. n_observations: (N,) int32, frames
     that found the point. keyframe_Ts_world_camera: (K, 4, 4). keyframe_indices: (K,) int64 frame
-    indices.
+    indices. track_ids: (N,) int64, the points' lasting numbers in the observation log, or None.
     """
 
     points_m: Array
@@ -275,9 +278,12 @@ class StaticMap:
     n_observations: NDArray[np.int32]
     keyframe_Ts_world_camera: Array
     keyframe_indices: NDArray[np.int64]
+    track_ids: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         N, K = len(self.points_m), len(self.keyframe_indices)
+        if self.track_ids is not None:
+            check_shape("StaticMap", "track_ids", self.track_ids, (N,))
         check_shape("StaticMap", "points_m", self.points_m, (N, 3))
         check_shape("StaticMap", "colors", self.colors, (N, 3))
         check_shape("StaticMap", "n_observations", self.n_observations, (N,))

@@ -74,7 +74,7 @@ def test_imports_go_down_the_layers(file: Path) -> None:
         assert top not in ("tests", "notebooks"), f"imports {module}"
 
 
-NOUNS = ("types", "object_types", "shapes")
+NOUNS = ("types", "object_types", "frame_observations", "shapes")
 
 
 @pytest.mark.parametrize("name", NOUNS)

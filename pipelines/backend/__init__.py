@@ -1,5 +1,5 @@
-"""The back-end: what works beside tracking, on keyframes instead of frames.
+"""The back-end: what works beside tracking, on keyframes and on what whole runs saw.
 
-Owns the recognition of places seen before, and everything that moves keyframes and points after
-they were tracked. Does not own tracking, nor the map that tracking reads.
+Owns the recognition of places seen before, and everything that moves poses and points after they
+were tracked; gtsam is imported here alone. Does not own tracking, nor the map that tracking reads.
 """

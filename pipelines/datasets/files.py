@@ -66,7 +66,7 @@ class DepthCoding:
 
     def to_metres(self, raw: NDArray[np.uint16]) -> NDArray[np.float32]:
         """(H, W) float32 metres of raw values (H, W); NaN where 0, saturated or absurd."""
-        return np.take(self._metres, raw)
+        return np.asarray(cv2.LUT(raw, self._metres), np.float32)
 
 
 def clean_depth(depth_m: NDArray) -> NDArray[np.float32]:
@@ -234,7 +234,7 @@ def _read_label_text(path: Path, size: Size) -> NDArray[np.int32]:
     width, height = size
     content = _read_bytes(path, "a matrix of labels")
     try:
-        values = np.fromstring(content.decode("ascii"), np.int32, sep=" ")
+        values = _numbers(content)
     except (UnicodeDecodeError, ValueError, DeprecationWarning) as error:
         raise DamagedFileError(f"Labels {path}: expected integers, found other text.") from error
     if values.size != width * height:
@@ -243,6 +243,21 @@ def _read_label_text(path: Path, size: Size) -> NDArray[np.int32]:
             f"found {values.size}; masks and images must have one size."
         )
     return values.reshape(height, width)
+
+
+def _numbers(content: bytes) -> NDArray[np.int32]:
+    """The whole numbers (N,) of a text, line by line: lines of single digits need no parser.
+
+    Most lines of labels are such, and their digits are every other byte.
+    """
+    parts = []
+    for line in content.splitlines():
+        digits = line[::2]
+        if digits.isdigit() and (len(line) < 2 or line[1::2].isspace()):
+            parts.append(np.frombuffer(digits, np.uint8) - np.uint8(ord("0")))
+        elif line and not line.isspace():
+            parts.append(np.fromstring(line.decode("ascii"), np.int32, sep=" "))
+    return np.concatenate([np.empty(0, np.int32), *parts], dtype=np.int32)
 
 
 def _check_size(path: Path, what: str, pixels: NDArray, size: Size | None) -> None:

@@ -5,6 +5,7 @@ Owns which files are compared with which. The definitions are in `camera` and `o
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,11 @@ from pipelines.evaluation.camera import associate, evaluate_camera
 from pipelines.evaluation.object_truth import RunFrames
 from pipelines.evaluation.objects import evaluate_objects
 from pipelines.evaluation.table import metrics_text
+from pipelines.io import folder as names
+from pipelines.io.objects import read_objects
 from pipelines.io.result import Result, ResultWriter, load_result
+from pipelines.io.trajectory import read_tum
+from pipelines.object_types import ObjectEstimates
 from pipelines.types import Array
 
 
@@ -22,22 +27,44 @@ def evaluate_result(folder: Path | str) -> dict[str, Any]:
     """Renew metrics.json and metrics.txt of a result folder by its other files; all its metrics.
 
     Without camera_gt_tum.txt there is no "camera" block, and without objects_gt.csv no "objects"
-    block. Other blocks stay as they are. Raises FormatError where `folder` is no result folder or a
-    file of it is damaged.
+    block; "front_end" holds the same of what a batch started from. Other blocks stay as they are.
+    Raises FormatError where `folder` is no result folder or a file of it is damaged.
     """
     result = load_result(folder)
-    own = ("camera", "objects")
+    own = ("camera", "objects", "front_end")
     metrics = {key: value for key, value in result.metrics.items() if key not in own}
+    metrics |= _errors(result)
+    before = front_end_of(result)
+    if before is not None:
+        metrics["front_end"] = _errors(before)
+    writer = ResultWriter(result.folder)
+    writer.write_metrics(metrics, metrics_text(metrics, result.timings))
+    return metrics
+
+
+def _errors(result: Result) -> dict[str, Any]:
+    """The blocks "camera" and "objects", as far as the truth is known."""
+    blocks: dict[str, Any] = {}
     if result.gt_Ts_world_camera is not None:
-        metrics["camera"] = evaluate_camera(
+        blocks["camera"] = evaluate_camera(
             result.timestamps_s, result.Ts_world_camera, *truth_by_frame(result)
         )
     if result.gt_objects is not None:
         frames = processed_frames(result)
-        metrics["objects"] = evaluate_objects(result.objects, result.gt_objects, frames)
-    writer = ResultWriter(result.folder)
-    writer.write_metrics(metrics, metrics_text(metrics, result.timings))
-    return metrics
+        blocks["objects"] = evaluate_objects(result.objects, result.gt_objects, frames)
+    return blocks
+
+
+def front_end_of(result: Result) -> Result | None:
+    """The same result with what the front-end had said, where a batch has changed it, or None."""
+    kept = result.folder / names.FRONT_END
+    if not (kept / names.CAMERA_TUM).exists():
+        return None
+    stamps, Ts = read_tum(kept / names.CAMERA_TUM)
+    objects = ObjectEstimates.empty()
+    if (kept / names.OBJECTS_CSV).exists():
+        objects = read_objects(kept / names.OBJECTS_CSV)
+    return replace(result, timestamps_s=stamps, Ts_world_camera=Ts, objects=objects)
 
 
 def processed_frames(result: Result) -> RunFrames:

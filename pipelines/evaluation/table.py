@@ -15,7 +15,8 @@ ERRORS = "Camera errors"
 OBJECTS = "Object errors"
 FOUND = "Objects found"
 TIMES = "Time a frame"
-HEADINGS = (ERRORS, OBJECTS, FOUND, TIMES)  # a block's first line begins with one of them
+BATCH = "Global batch"
+HEADINGS = (ERRORS, OBJECTS, FOUND, BATCH, TIMES)  # a block's first line begins with one of them
 STATISTICS = ("rmse", "mean", "median", "max")
 ERROR_ROWS = (  # label, unit, digits, keys of the statistics with {} for their name
     ("ATE, SE(3) aligned", "m", 4, "ate_{}_m"),
@@ -63,6 +64,9 @@ def metrics_text(metrics: dict[str, Any], timings: dict[str, Any] | None = None)
         width = max(len(label) for label, _ in found)
         lines = [f"{label:<{width}}  {words}" for label, words in found]
         blocks.append("\n".join([FOUND, *lines]))
+    batch = batch_rows(metrics)
+    if batch:
+        blocks.append(_block([(BATCH, "before", "after", ""), *batch]))
     if times:
         blocks.append(_block([(TIMES, "median", "95 %", ""), *times]))
     return "\n\n".join(blocks) + "\n"
@@ -119,6 +123,35 @@ def object_error_rows(metrics: dict[str, Any]) -> list[Row]:
         values = [objects.get(block, {}).get(key.format(name)) for name in STATISTICS]
         if values[0] is not None:
             rows.append((label, *("" if v is None else f"{v:.{digits}f}" for v in values), unit))
+    return rows
+
+
+def batch_rows(metrics: dict[str, Any]) -> list[Row]:
+    """Rows (label, before, after, unit) of what a batch did: RMSEs where the truth is known."""
+    batch, before = metrics.get("batch"), metrics.get("front_end", {})
+    if not batch:
+        return []
+    rows: list[Row] = []
+    held = batch.get("camera")
+    if held and held["error_before"] is not None:
+        cells = (f"{held['error_before']:.3f}", f"{held['error_after']:.3f}")
+        rows.append(("Held-out sightings, camera", *cells, "standard deviations"))
+    for label, unit, digits, key in ERROR_ROWS:
+        values = [m.get("camera", {}).get(key.format("rmse")) for m in (before, metrics)]
+        if None not in values:
+            rows.append((label, *(f"{value:.{digits}f}" for value in values), unit))
+    for label, unit, digits, block, key in OBJECT_ROWS:
+        values = [
+            m.get("objects", {}).get(block, {}).get(key.format("rmse")) for m in (before, metrics)
+        ]
+        if None not in values:
+            rows.append((f"Objects: {label.lower()}", *(f"{v:.{digits}f}" for v in values), unit))
+    objects = batch.get("objects", {})
+    kept = sorted(int(i) for i, verdict in objects.items() if not verdict["accepted"])
+    if not batch["accepted"]:
+        rows.append(("Refused: the front-end's answers are kept", "", "", ""))
+    elif kept:
+        rows.append((f"Refused for objects {', '.join(map(str, kept))}", "", "", ""))
     return rows
 
 

@@ -21,31 +21,41 @@ _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.005)
 
 
 def align_patches(
-    gray_from: Image, gray_to: Image, uv_from_px: Array, predicted_px: Array, max_shift_px: float
+    gray_from: Image,
+    gray_to: Image,
+    uv_from_px: Array,
+    predicted_px: Array,
+    max_shift_px: float,
+    sure: NDArray[np.bool_] | None = None,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Places (N, 2) in `gray_to` of the patches around `uv_from_px` (N, 2) of `gray_from`.
 
     gray_from, gray_to: (H, W). Starts at `predicted_px` (N, 2), NaN where there is no prediction.
+    sure: (N,) which predictions are good to a pixel or two, so that the coarse level, half of the
+    work, is not needed; none by default.
     The second answer (N,) says which converged within `max_shift_px` of their prediction.
     """
     n = len(uv_from_px)
-    if n == 0:
-        return np.empty((0, 2)), np.zeros(0, bool)
     known = np.asarray(np.isfinite(predicted_px).all(axis=1))
     start = np.where(known[:, None], predicted_px, uv_from_px)
-    placed, status, _ = cv2.calcOpticalFlowPyrLK(
-        gray_from,
-        gray_to,
-        np.ascontiguousarray(uv_from_px[:, None], dtype=np.float32),
-        np.ascontiguousarray(start[:, None], dtype=np.float32),
-        winSize=(_WINDOW_PX, _WINDOW_PX),
-        maxLevel=_PYRAMID_LEVELS,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        criteria=_STOP,
-    )
-    uv = placed[:, 0].astype(np.float64)
+    uv, found = start.copy(), np.zeros(n, bool)
+    sure = np.zeros(n, bool) if sure is None else sure
+    for which, levels in ((known & ~sure, _PYRAMID_LEVELS), (known & sure, 0)):
+        if not which.any():
+            continue
+        placed, status, _ = cv2.calcOpticalFlowPyrLK(
+            gray_from,
+            gray_to,
+            np.ascontiguousarray(uv_from_px[which, None], dtype=np.float32),
+            np.ascontiguousarray(start[which, None], dtype=np.float32),
+            winSize=(_WINDOW_PX, _WINDOW_PX),
+            maxLevel=levels,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            criteria=_STOP,
+        )
+        uv[which], found[which] = placed[:, 0], status[:, 0] > 0
     shift = np.linalg.norm(uv - start, axis=1)
-    return uv, known & (status[:, 0] > 0) & (shift <= max_shift_px)
+    return uv, found & (shift <= max_shift_px)
 
 
 def fuse_measurements(

@@ -70,7 +70,9 @@ def measure_points(
     by_flow = np.asarray(np.isfinite(flow_uv).all(axis=1))
     tolerance = config.flow_tolerance_px if by_flow.any() else _ALIGNMENT_TOLERANCE_PX
     tracks = last.tracks
-    aligned, ok = align_patches(last.view.gray, view.gray, tracks.uv_px, start, tolerance)
+    aligned, ok = align_patches(
+        last.view.gray, view.gray, tracks.uv_px, start, tolerance, sure=by_flow
+    )
     sigma = sensor.noise.sigma_uv_px
     uv, valid, sigma_px = fuse_measurements(
         flow_uv, by_flow, sigma["flow"], aligned, ok, sigma["alignment"]

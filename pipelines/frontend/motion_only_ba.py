@@ -34,6 +34,8 @@ _MIN_POINTS = 6  # fewer cannot be told from an accident
 _MAX_ITERATIONS = 10  # Levenberg-Marquardt steps per round
 _CONVERGED_SIGMAS = 0.01  # a step this small beside the pose's standard deviation ends the last
 _ROBUST_SIGMAS = 0.1  # and this small any other round: weights change after it anyway
+_ROUNDING = 1e-9  # of a cost: no worse than this is no worse, and no reason to try shorter steps
+_I6 = np.eye(6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,8 +158,13 @@ def _residual_covariance(
     camera: StereoCamera, points_camera: Array, R: Array, observations: StereoObservations
 ) -> Array:
     """The same from points (N, 3) in the camera and rotations (3, 3) or (N, 3, 3) to it."""
-    J = projection_jacobian(camera, points_camera) @ np.swapaxes(R, -1, -2)
-    S = J @ observations.point_covariances_m2 @ J.transpose(0, 2, 1)
+    J = projection_jacobian(camera, points_camera)
+    if R.ndim == 2:  # one product, not N of them
+        J = (J.reshape(-1, 3) @ R.T).reshape(-1, 3, 3)
+    else:
+        J = J @ np.ascontiguousarray(np.swapaxes(R, -1, -2))
+    # Rows in a row: products of transposed views take twice the time
+    S = J @ observations.point_covariances_m2 @ np.ascontiguousarray(J.transpose(0, 2, 1))
     return add_pixel_noise(S, observations)
 
 
@@ -194,11 +201,28 @@ def whitening(covariances: Array) -> Array:
     return W
 
 
+@dataclass(frozen=True, slots=True)
+class _Sight:
+    """All points (N) as seen from poses `Ts` (J, 4, 4).
+
+    points: (3, N) in the camera, with inverse_z: (N,). visible: (N,) in front of it. errors: (3, N)
+    residuals of u_L, v, u_R, whitened; chi2: (N,) their squared lengths.
+    """
+
+    Ts: Array
+    points: Array
+    inverse_z: Array
+    visible: NDArray[np.bool_]
+    errors: Array
+    chi2: Array
+
+
 class _Problem:
     """The least-squares problems of the poses of J bodies, whitened at given guesses.
 
     Arrays are kept by component (3, N) rather than by point: long contiguous rows are what makes
-    numpy fast here, and all bodies share them.
+    numpy fast here, and all bodies share them. What was seen from the last poses is kept, as their
+    cost, their normal equations and their inliers are asked for one after the other.
     """
 
     def __init__(
@@ -209,8 +233,10 @@ class _Problem:
         sizes: NDArray[np.int64],
     ) -> None:
         self.camera = camera
-        ends = np.cumsum(sizes)
+        self._sizes, ends = sizes, np.cumsum(sizes)
         self.bodies = [slice(int(end - n), int(end)) for n, end in zip(sizes, ends, strict=True)]
+        self._filled = np.flatnonzero(sizes > 0)
+        self._starts = (ends - sizes)[self._filled]
         known = np.isfinite(observations.points_world_m).all(axis=1)
         known &= np.isfinite(observations.uvr_px[:, :2]).all(axis=1)
         self.points = observations.points_world_m.T.copy()
@@ -218,18 +244,26 @@ class _Problem:
         self.mono = np.isnan(observations.uvr_px[:, 2])
         self.uvr = np.nan_to_num(observations.uvr_px).T.copy()
         self.limit = np.where(self.mono, CHI2_95_2DOF, CHI2_95_3DOF)
-        x, y, inverse_z, visible = self._in_camera(Ts)
-        points_camera = np.stack([x, y, 1.0 / inverse_z], -1)
+        points, inverse_z, visible = self._in_camera(Ts)
+        points_camera = np.stack([points[0], points[1], 1.0 / inverse_z], -1)
         R = Ts[0, :3, :3] if len(Ts) == 1 else np.repeat(Ts[:, :3, :3], sizes, axis=0)
         W = whitening(_residual_covariance(camera, points_camera, R, observations))
         W[self.mono, 2] = 0.0  # the first two rows do not know of the third
         self.usable = known & visible & np.isfinite(W).all(axis=(1, 2))
         W[~self.usable] = 0.0  # nothing is known of a projection from behind
         self.W = W.transpose(1, 2, 0).copy()
+        self._sight: _Sight | None = None
+
+    def _sum(self, values: Array) -> Array:
+        """(J,) sums of values (N,) over each body."""
+        sums = np.zeros(len(self.bodies))
+        if len(self._filled):
+            sums[self._filled] = np.add.reduceat(values, self._starts)
+        return sums
 
     def count(self, used: NDArray[np.bool_]) -> NDArray[np.int64]:
         """(J,) how many observations of each body are used."""
-        return np.array([int(used[body].sum()) for body in self.bodies])
+        return self._sum(used.astype(float)).astype(np.int64)
 
     def allow_for_noise(self, Ts: Array) -> None:
         """Widen a body's weights where it is so noisy that half of it would be rejected.
@@ -244,74 +278,81 @@ class _Problem:
             excess = float(np.median(share[body]))
             if excess > _NOISY:
                 self.W[:, :, body] /= min(np.sqrt(excess), _MAX_NOISE_FACTOR)
+                self._sight = None
 
-    def _in_camera(self, Ts: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-        """x, y, 1 / z of the points in the camera, each (N,), and which are in front of it."""
-        q = np.empty_like(self.points)
-        for T, body in zip(Ts, self.bodies, strict=True):
-            np.matmul(T[:3, :3].T, self.points[:, body] - T[:3, 3:], out=q[:, body])
-        x, y, z = q
-        visible = z > MIN_DEPTH_M
-        return x, y, 1.0 / np.where(visible, z, 1.0), visible
+    def _in_camera(self, Ts: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """The points in the camera (3, N), 1 / z (N,), and which are in front of it (N,)."""
+        Ts_camera_body = invert_T(Ts)
+        if len(Ts) == 1:
+            q = Ts_camera_body[0, :3, :3] @ self.points + Ts_camera_body[0, :3, 3:]
+        else:  # each point with the numbers of its own body: quicker than body by body
+            of_body = Ts_camera_body[:, :3].transpose(2, 1, 0).reshape(12, -1)
+            a, b, c, t = np.repeat(of_body, self._sizes, axis=1).reshape(4, 3, -1)
+            q = a * self.points[0] + b * self.points[1] + c * self.points[2] + t
+        visible = q[2] > MIN_DEPTH_M
+        return q, 1.0 / np.where(visible, q[2], 1.0), visible
 
-    def _residual_rows(self, x: Array, y: Array, inverse_z: Array) -> tuple[Array, Array, Array]:
+    def _residual_rows(self, points: Array, inverse_z: Array) -> tuple[Array, Array, Array]:
         """Measured minus predicted u_L, v, u_R, each (N,); eqs. (1) and (3)."""
         camera = self.camera
-        u = camera.fx * x * inverse_z + camera.cx
-        v = camera.fy * y * inverse_z + camera.cy
+        u = camera.fx * points[0] * inverse_z + camera.cx
+        v = camera.fy * points[1] * inverse_z + camera.cy
         u_right = u - camera.bf * inverse_z
         return self.uvr[0] - u, self.uvr[1] - v, np.where(self.mono, 0.0, self.uvr[2] - u_right)
 
-    def _whiten(self, a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
+    def _look(self, Ts: Array) -> _Sight:
+        """All points as seen from poses (J, 4, 4), which nobody changes in place."""
+        if self._sight is not None and self._sight.Ts is Ts:
+            return self._sight
         W = self.W
-        return W[0, 0] * a, W[1, 0] * a + W[1, 1] * b, W[2, 0] * a + W[2, 1] * b + W[2, 2] * c
+        points, inverse_z, visible = self._in_camera(Ts)
+        du, dv, du_right = self._residual_rows(points, inverse_z)
+        e = W[:, 0] * du
+        e[1:] += W[1:, 1] * dv
+        e[2] += W[2, 2] * du_right
+        squared = e * e
+        chi2 = squared[0] + squared[1] + squared[2]
+        self._sight = _Sight(Ts, points, inverse_z, visible, e, chi2)
+        return self._sight
 
     def residuals(self, Ts: Array) -> Array:
         """(N, 3) residuals in px, 0 where unmeasured."""
-        return np.stack(self._residual_rows(*self._in_camera(Ts)[:3]), -1)
+        return np.stack(self._residual_rows(*self._in_camera(Ts)[:2]), -1)
 
     def chi2(self, Ts: Array) -> Array:
         """(N,) squared Mahalanobis distances, inf behind the camera (now or when whitened)."""
-        x, y, inverse_z, visible = self._in_camera(Ts)
-        e0, e1, e2 = self._whiten(*self._residual_rows(x, y, inverse_z))
-        return np.where(visible & self.usable, e0 * e0 + e1 * e1 + e2 * e2, np.inf)
+        sight = self._look(Ts)
+        return np.where(sight.visible & self.usable, sight.chi2, np.inf)
 
     def cost(self, Ts: Array, used: NDArray[np.bool_], robust: bool) -> Array:
         """(J,) half the (Huber) costs of the used observations; one behind costs a lot."""
         chi2, limit = np.minimum(self.chi2(Ts), 1e6 * self.limit), self.limit
         if robust:
             chi2 = np.where(chi2 <= limit, chi2, 2.0 * np.sqrt(limit * chi2) - limit)
-        chi2 *= used
-        return np.array([0.5 * float(chi2[body].sum()) for body in self.bodies])
+        return 0.5 * self._sum(chi2 * used)
 
     def normal_equations(
         self, Ts: Array, used: NDArray[np.bool_], robust: bool
     ) -> tuple[Array, Array]:
         """J^T W J (J, 6, 6) and J^T W r (J, 6) at `Ts`, for right perturbations [omega, v]."""
-        camera = self.camera
-        x, y, inverse_z, visible = self._in_camera(Ts)
+        camera, W, sight = self.camera, self.W, self._look(Ts)
+        (x, y, _), inverse_z, e = sight.points, sight.inverse_z, sight.errors
         z = 1.0 / inverse_z
-        e = np.stack(self._whiten(*self._residual_rows(x, y, inverse_z)))
-        weight = (used & visible & self.usable).astype(float)
+        weight = (used & sight.visible & self.usable).astype(float)
         if robust:
-            chi2 = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
-            weight *= np.minimum(1.0, np.sqrt(self.limit / np.maximum(chi2, 1e-12)))
-        # d(u_L, v, u_R) / d(point in the camera), whitened, column by column
+            weight *= np.minimum(1.0, np.sqrt(self.limit / np.maximum(sight.chi2, 1e-12)))
+        # d(u_L, v, u_R) / d(point in the camera), whitened, column by column: each (3, N)
         fx, fy = camera.fx * inverse_z, camera.fy * inverse_z
-        du_dz = -fx * x * inverse_z
-        zero = np.zeros_like(x)
-        along_x = self._whiten(fx, zero, fx)
-        along_y = self._whiten(zero, fy, zero)
-        along_z = self._whiten(
-            du_dz, -fy * y * inverse_z, du_dz + camera.bf * inverse_z * inverse_z
-        )
+        of_u = W[:, 0].copy()  # u_R moves as u_L does
+        of_u[2] += W[2, 2]
+        along_x, along_y, along_z = of_u * fx, W[:, 1] * fy, of_u * (-fx * x * inverse_z)
+        along_z += W[:, 1] * (-fy * y * inverse_z)
+        along_z[2] += W[2, 2] * (camera.bf * inverse_z * inverse_z)
         J = np.empty((6, 3, len(x)))
-        for row in range(3):
-            ax, ay, az = along_x[row], along_y[row], along_z[row]
-            J[0, row] = ay * z - az * y  # the point moves by [q]x omega - v
-            J[1, row] = az * x - ax * z
-            J[2, row] = ax * y - ay * x
-            J[3, row], J[4, row], J[5, row] = -ax, -ay, -az
+        J[0] = along_y * z - along_z * y  # the point moves by [q]x omega - v
+        J[1] = along_z * x - along_x * z
+        J[2] = along_x * y - along_y * x
+        J[3], J[4], J[5] = -along_x, -along_y, -along_z
         weighted = J * weight
         H, g = np.empty((len(Ts), 6, 6)), np.empty((len(Ts), 6))
         for j, body in enumerate(self.bodies):
@@ -332,16 +373,16 @@ class _Problem:
         H, g = self.normal_equations(Ts, used, robust)
         for _ in range(max_steps):
             diagonal = damping[:, None] * np.diagonal(H, axis1=1, axis2=2) + 1e-9
-            step = np.linalg.solve(H + diagonal[:, :, None] * np.eye(6), g[..., None])[..., 0]
+            step = np.linalg.solve(H + diagonal[:, :, None] * _I6, g[..., None])[..., 0]
             going &= np.isfinite(step).all(axis=1)
             step[~going] = 0.0
             Ts_new = Ts @ exp_se3(step)
             cost_new = self.cost(Ts_new, used, robust)
-            better = going & (cost_new <= cost)
-            Ts = np.where(better[:, None, None], Ts_new, Ts)
+            better = going & (cost_new <= cost + _ROUNDING * (1.0 + cost))
+            Ts = Ts_new if better.all() else np.where(better[:, None, None], Ts_new, Ts)
             cost = np.where(better, cost_new, cost)
             damping = np.where(better, np.maximum(damping * 0.1, 1e-9), damping * 100.0)
-            length2 = np.einsum("ji,jik,jk->j", step, H, step)
+            length2 = ((H @ step[..., None])[..., 0] * step).sum(1)
             going &= ~(better & (length2 < converged)) & (damping <= 1e6)
             if not going.any():
                 break

@@ -19,7 +19,7 @@ _MIN_SUPPORT = 0.6  # share of the window that must lie on the plane
 _DX, _DY = (
     grid.ravel() for grid in np.meshgrid(np.arange(-_HALF, _HALF + 1), np.arange(-_HALF, _HALF + 1))
 )  # px, of the window's pixels from its centre
-_INNER = (np.abs(_DX) <= 1) & (np.abs(_DY) <= 1)
+_INNER = np.flatnonzero((np.abs(_DX) <= 1) & (np.abs(_DY) <= 1))
 _MOMENTS = np.stack([np.ones(len(_DX)), _DX, _DY, _DX**2, _DY**2, _DX * _DY], -1)
 
 
@@ -55,10 +55,12 @@ def sample_disparity(disparity_px: NDArray[np.float32], uv_px: Array, sigma_px: 
     H, W = disparity_px.shape
     x0 = np.clip(np.rint(uv_px[:, 0]).astype(np.int64), _HALF, W - 1 - _HALF)
     y0 = np.clip(np.rint(uv_px[:, 1]).astype(np.int64), _HALF, H - 1 - _HALF)
-    window = disparity_px[y0[:, None] + _DY, x0[:, None] + _DX].astype(np.float64)
-    centre = np.sort(window[:, _INNER], axis=1)  # NaN sorts last
+    pixels = (y0 * W + x0)[:, None] + (_DY * W + _DX)
+    window = np.take(disparity_px.ravel(), pixels)
+    centre = np.sort(np.take(window, _INNER, axis=1), axis=1)  # NaN sorts last
     n_valid = np.isfinite(centre).sum(1)
-    median = centre[np.arange(len(centre)), np.maximum(n_valid - 1, 0) // 2]
+    median = centre[np.arange(len(centre)), np.maximum(n_valid - 1, 0) // 2].astype(np.float64)
+    window = window.astype(np.float64)
     edge = _EDGE_SHARE * median + _EDGE_SIGMAS * sigma_px
     window -= median[:, None]
     on_plane = np.abs(window) < edge[:, None]

@@ -25,6 +25,9 @@ STATIC_MAP = "static_map.ply"
 METRICS_JSON = "metrics.json"
 METRICS_TXT = "metrics.txt"
 TIMINGS = "timings.json"
+CAMERA_STD = "camera_std.csv"
+OBSERVATIONS = "observations"  # a folder: what each frame saw, for the batch
+FRONT_END = "front_end"  # a folder: what the batch started from
 FRAMES = "frames"
 PLOTS = "plots"
 RENDERS = "renders"
@@ -62,9 +65,11 @@ def clear_result_folder(folder: Path | str) -> None:
     folder = Path(folder)
     _check_output(folder)
     files = [CONFIG, LOG, CAMERA_TUM, CAMERA_KITTI, CAMERA_GT_TUM, STATIC_MAP]
-    files += [OBJECTS_CSV, OBJECTS_GT_CSV]
+    files += [OBJECTS_CSV, OBJECTS_GT_CSV, CAMERA_STD]
     stale = [folder / name for name in (*files, METRICS_JSON, METRICS_TXT, TIMINGS)]
     stale += (folder / OBJECTS).glob("*_tum.txt")
+    stale += [*(folder / OBSERVATIONS).glob("*.npz"), *(folder / OBSERVATIONS).glob("*.json")]
+    stale += [*(folder / FRONT_END).glob("*.*"), *(folder / FRONT_END / OBJECTS).glob("*_tum.txt")]
     for name in (FRAMES, PLOTS, RENDERS):
         stale += [*(folder / name).glob("*.png"), *(folder / name).glob("*.jpg")]
     try:

@@ -30,7 +30,7 @@ _POINT_ARRAYS: Shapes = {
     "position_m": ((3,), np.float64), "covariance_m2": ((3, 3), np.float64),
     "offset_slope": ((3,), np.float64), "descriptor": ((32,), np.uint8), "color": ((3,), np.uint8),
     "n_found": ((), np.int32), "n_visible": ((), np.int32), "n_keyframes": ((), np.int32),
-    "first_keyframe": ((), np.int64), "alive": ((), np.bool_),
+    "first_keyframe": ((), np.int64), "alive": ((), np.bool_), "serial": ((), np.int64),
 }  # fmt: skip
 _KEYFRAME_ARRAYS: Shapes = {
     "frame_index": ((), np.int64), "timestamp_s": ((), np.float64),

@@ -20,6 +20,7 @@ points.npz, N points; a point's id is its row, and dead rows stay because keyfra
     n_keyframes         (N,)       int32    keyframes that observe it
     first_keyframe      (N,)       int64    row of the first of these in keyframes.npz, -1 for none
     alive               (N,)       bool     False where the point was culled
+    serial              (N,)       int64    lasting number of the point, as rows are used again
 
 keyframes.npz, K keyframes in the order of their frames. What differs in number from keyframe to
 keyframe lies end to end: rows start[k] to start[k + 1] are keyframe k's, start having K + 1 rows.

@@ -33,25 +33,33 @@ CENTER, VELOCITY = ("center_x_m", "center_y_m", "center_z_m"), ("vx_mps", "vy_mp
 SMOOTHED = ("smoothed_speed_kmh", "smoothed_speed_std_kmh")
 SPREAD = ("H_std_t_m", "H_std_R_deg")
 SIZE = ("size_x_m", "size_y_m", "size_z_m")
+POSE_SPREAD = ("L_std_t_m", "L_std_R_deg")
 COLUMNS = (
     *IDENTITY, *BOX, "n_points", *L_COLUMNS, *H_COLUMNS, *SPEED,
-    *CENTER, *VELOCITY, *SMOOTHED, *SPREAD, *SIZE,
+    *CENTER, *VELOCITY, *SMOOTHED, *SPREAD, *SIZE, *POSE_SPREAD,
 )  # fmt: skip
 
 
-def write_objects(path: Path | str, objects: ObjectEstimates) -> None:
+def write_objects(
+    path: Path | str, objects: ObjectEstimates, pose_std: Array | None = None
+) -> None:
     """Write objects.csv: its header, then a row per object and frame in their order.
 
     L is the object's pose and H its motion since the frame before, both in the world, as position
     and quaternion. speed_kmh is that of eq. (6) where there is an H, the filter's in coasting rows,
     and else empty, as all that is not known is. H_std_ are the square roots of the traces of H's
-    two diagonal covariance blocks. Raises DyObError where the disk refuses.
+    two diagonal covariance blocks. pose_std: (M, 2) the same of L in m and deg, which only a batch
+    knows. Raises DyObError where the disk refuses.
     """
-    write_table(path, COLUMNS, _rows(objects))
+    if pose_std is None:
+        pose_std = np.full((len(objects), len(POSE_SPREAD)), np.nan)
+    write_table(path, COLUMNS, _rows(objects, pose_std))
 
 
 def read_objects(path: Path | str) -> ObjectEstimates:
-    """The rows of objects.csv; what the file does not hold (full covariances) is NaN.
+    """The rows of objects.csv.
+
+    The file holds no full covariances: each H gets the round ones of the same traces, or NaN.
 
     Raises FormatError, with the line's number, where a column is missing or a cell is no number.
     """
@@ -73,7 +81,7 @@ def read_objects(path: Path | str) -> ObjectEstimates:
         n_points=table.integers("n_points"),
         Ts_world_object=table.poses(L_COLUMNS),
         Hs_world_curr_prev=Hs,
-        motion_covariances=np.full((len(Hs), 6, 6), np.nan),
+        motion_covariances=_round_covariances(table.numbers(SPREAD)),
         centers_m=table.numbers(CENTER),
         speed_mps=speeds[:, 0],
         speed_std_mps=speeds[:, 1],
@@ -204,7 +212,17 @@ def _number(text: str) -> float:
     return float(text) if text else np.nan
 
 
-def _rows(objects: ObjectEstimates) -> Iterable[list[str]]:
+def _round_covariances(spread: Array) -> Array:
+    """(N, 6, 6) diagonal ones of [omega, v], of standard deviations (N, 2) in m and deg."""
+    std = np.column_stack([np.radians(spread[:, 1]), spread[:, 0]]) / np.sqrt(3.0)
+    covariances = np.zeros((len(spread), 6, 6))
+    axes = np.arange(6)
+    covariances[:, axes, axes] = np.repeat(std**2, 3, axis=1)
+    covariances[~np.isfinite(std).all(1)] = np.nan
+    return covariances
+
+
+def _rows(objects: ObjectEstimates, pose_std: Array) -> Iterable[list[str]]:
     spread_m, spread_deg = motion_spread(objects)
     coasting = objects.state == str(ObjectState.COASTING)
     smoothed = objects.smoothed_speed_mps
@@ -216,7 +234,7 @@ def _rows(objects: ObjectEstimates) -> Iterable[list[str]]:
             *(KMH * speed[i : i + 1]), *(KMH * speed_std[i : i + 1]),
             *objects.centers_m[i], *objects.velocities_mps[i],
             KMH * smoothed[i], KMH * objects.velocity_std_mps[i],
-            spread_m[i], spread_deg[i], *objects.extents_m[i],
+            spread_m[i], spread_deg[i], *objects.extents_m[i], *pose_std[i],
         ]  # fmt: skip
         yield [
             str(objects.frame_index[i]), f"{objects.timestamp_s[i]:.9f}",

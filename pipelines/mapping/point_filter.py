@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.frontend.motion_only_ba import add_pixel_noise
+from pipelines.frontend.motion_only_ba import add_pixel_noise, whitening
 from pipelines.geometry import (
     backproject,
     invert_T,
@@ -76,29 +76,43 @@ def refine_points(
     points = transform_points(invert_T(T_world_camera), observations.points_world_m)
     D = projection_jacobian(camera, points)
     J_pose = pose_jacobian(D, points)
-    J_point = D @ R.T
+    J_point = _each_times(D, R.T)
     residual = observations.uvr_px - project_stereo(camera, points)
     mono = np.isnan(residual[:, 2])
     slope = -np.einsum("nij,nj->ni", J_point, offset_slopes)  # d residual / d offset
     slope[:, 2] -= 1.0
     residual[mono, 2] = slope[mono, 2] = 0.0
-    S = add_pixel_noise(J_pose @ pose_covariance @ J_pose.transpose(0, 2, 1), observations)
+    if pose_covariance.ndim == 2:
+        J_covariance = _each_times(J_pose, pose_covariance)
+    else:
+        J_covariance = J_pose @ pose_covariance
+    S = add_pixel_noise(J_covariance @ _transposed(J_pose), observations)
     P = observations.point_covariances_m2
     J_point[mono, 2, :] = 0.0
     S[mono, 2, :] = 0.0
     S[mono, :, 2] = 0.0
     S[mono, 2, 2] = 1.0
-    PJt = P @ J_point.transpose(0, 2, 1)
-    gain = np.linalg.solve(J_point @ PJt + S, PJt.transpose(0, 2, 1)).transpose(0, 2, 1)
-    step = np.einsum("nij,nj->ni", gain, residual) @ R
-    P_new = P - gain @ J_point @ P
+    JP = J_point @ P
+    W = whitening(JP @ _transposed(J_point) + S)
+    B = W @ JP  # the gain is B^T W
+    step = np.einsum("nji,nj->ni", B, np.einsum("nij,nj->ni", W, residual)) @ R
     moved, M = _step_in_inverse_depth(points, step)
-    M = R @ M @ R.T
-    P_new = M @ P_new @ M.transpose(0, 2, 1)
+    M = _each_times(_transposed(_each_times(_transposed(M), R.T)), R.T)
+    P_new = M @ (P - _transposed(B) @ B) @ _transposed(M)
     P_new = 0.5 * (P_new + P_new.transpose(0, 2, 1))
-    slope_new = offset_slopes + np.einsum("nij,nj->ni", gain, slope)
+    slope_new = offset_slopes + np.einsum("nji,nj->ni", B, np.einsum("nij,nj->ni", W, slope))
     slope_new = np.einsum("nij,nj->ni", M, slope_new)
     return transform_points(T_world_camera, moved), P_new, slope_new
+
+
+def _each_times(matrices: Array, right: Array) -> Array:
+    """Matrices (N, I, K), each times one and the same (K, K): a single product, not N of them."""
+    return (matrices.reshape(-1, len(right)) @ right).reshape(matrices.shape)
+
+
+def _transposed(matrices: Array) -> Array:
+    """Matrices (N, I, K) as (N, K, I), copied: products of rows in a row take half the time."""
+    return np.ascontiguousarray(matrices.transpose(0, 2, 1))
 
 
 def _step_in_inverse_depth(points: Array, step: Array) -> tuple[Array, Array]:
@@ -112,15 +126,10 @@ def _step_in_inverse_depth(points: Array, step: Array) -> tuple[Array, Array]:
     inverse_z = 1.0 / z - step[:, 2] / z**2
     z_new = 1.0 / np.clip(inverse_z, 1.0 / (_MAX_DEPTH_FACTOR * z), _MAX_DEPTH_FACTOR / z)
     moved = np.concatenate([ray_new, np.ones((len(z), 1))], 1) * z_new[:, None]
-    return moved, _inverse_depth_jacobian(ray_new, z_new) @ np.linalg.inv(
-        _inverse_depth_jacobian(ray, z)
-    )
-
-
-def _inverse_depth_jacobian(ray: Array, z: Array) -> Array:
-    """d(x, y, z) / d(x/z, y/z, 1/z), (N, 3, 3)."""
-    A = np.zeros((len(z), 3, 3))
-    A[:, 0, 0] = A[:, 1, 1] = z
-    A[:, :2, 2] = -ray * (z**2)[:, None]
-    A[:, 2, 2] = -(z**2)
-    return A
+    # d(x, y, z) / d(x/z, y/z, 1/z) at the new place, times its inverse at the old one
+    ratio = z_new / z
+    M = np.zeros((len(z), 3, 3))
+    M[:, 0, 0] = M[:, 1, 1] = ratio
+    M[:, :2, 2] = (ray_new * ratio[:, None] - ray) * ratio[:, None]
+    M[:, 2, 2] = ratio**2
+    return moved, M

@@ -42,6 +42,7 @@ _COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {
     "n_keyframes": ((), np.int32),  # keyframes that observe it
     "first_keyframe": ((), np.int64),  # position in `keyframes` of the first one, -1 before that
     "alive": ((), np.bool_),
+    "serial": ((), np.int64),  # the point's lasting number, as rows are used again
 }
 
 
@@ -62,6 +63,7 @@ class SparseMap:
     n_keyframes: NDArray[np.int32]
     first_keyframe: NDArray[np.int64]
     alive: NDArray[np.bool_]
+    serial: NDArray[np.int64]
 
     def __init__(self, camera: StereoCamera, config: MappingConfig) -> None:
         self.camera, self.config = camera, config
@@ -69,6 +71,7 @@ class SparseMap:
         self._covisible: list[Ids] = []  # per keyframe, its covisible ones, most shared first
         self._n_shared: list[Ids] = []  # with each of them
         self._size = 0
+        self._next_serial = 0
         self._free = np.empty(0, np.int64)
         self._young = np.empty(0, np.int64)  # points that no keyframe has seen yet
         self._keyframe_Ts = np.empty((0, 4, 4))
@@ -104,6 +107,7 @@ class SparseMap:
             _check_ids("covisible", others, (0, len(keyframes)))
         if len(covisible) != len(keyframes):
             raise ValueError(f"SparseMap.covisible: {len(covisible)} of {len(keyframes)} keyframes")
+        sparse_map._next_serial = int(columns["serial"].max(initial=-1)) + 1
         unseen = sparse_map.n_keyframes[:size] == 0
         sparse_map._free = np.flatnonzero(unseen & ~sparse_map.alive[:size])
         sparse_map._young = np.flatnonzero(unseen & sparse_map.alive[:size])
@@ -152,6 +156,8 @@ class SparseMap:
         self.n_keyframes[ids] = 0
         self.first_keyframe[ids] = -1
         self.alive[ids] = True
+        self.serial[ids] = self._next_serial + np.arange(len(ids))
+        self._next_serial += len(ids)
         self._young = np.concatenate([self._young, ids])
         return ids
 
@@ -328,6 +334,7 @@ class SparseMap:
             self.n_found[ids].copy(),
             self._keyframe_Ts.copy(),
             np.array([k.frame_index for k in self.keyframes], np.int64),
+            self.serial[ids].copy(),
         )
 
 

@@ -16,6 +16,7 @@ from pipelines.frontend.sampling import sample_bilinear
 from pipelines.types import Array, Image
 
 _TOLERANCE_PX = 6.0  # alignment may move a point this far from where it starts
+_SURE_PX = 1.5  # flow and expectation this near to each other say where to start, finely
 _NEAR_PX = 3.0  # how far the expected place itself may be off
 _SURPRISE_PX = 12.0  # flow that leads farther from the expected place is not of the object
 
@@ -75,12 +76,14 @@ def follow_points(
     by_flow[expected & strange] = np.nan
     has_flow = np.asarray(np.isfinite(by_flow).all(axis=1))
     start = np.where(expected[:, None], expected_px, by_flow)
-    aligned, has_alignment = align_patches(gray_prev, gray, uv_prev_px, start, _TOLERANCE_PX)
+    off_flow = np.linalg.norm(by_flow - expected_px, axis=1)
+    with np.errstate(invalid="ignore"):
+        sure = has_flow & ~(off_flow > _SURE_PX)
+    aligned, has_alignment = align_patches(gray_prev, gray, uv_prev_px, start, _TOLERANCE_PX, sure)
     sigma_flow, sigma_aligned = (
         noise.sigma_uv_px["object_flow"],
         noise.sigma_uv_px["object_alignment"],
     )
-    off_flow = np.linalg.norm(by_flow - expected_px, axis=1)
     off_aligned = np.linalg.norm(aligned - expected_px, axis=1)
     apart = np.linalg.norm(by_flow - aligned, axis=1) > 3.0 * np.hypot(sigma_flow, sigma_aligned)
     contradict = has_flow & has_alignment & apart

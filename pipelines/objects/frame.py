@@ -47,7 +47,8 @@ class ObjectFrame:
     labels: (H, W) int32 by lasting id. answered: whether there were detections at all. points,
     followed: tracked points of objects in sight, with where they are now. noise_was_learned:
     whether their noise was known by then. windows: id -> where its pixels are. scores: id -> of its
-    detection, 0 where the mask was carried. new_ids: objects without points in the frame before.
+    detection, 0 where there is none. new_ids: objects without points in the frame before.
+    carried_ids: objects without a detection, whose masks were carried.
     """
 
     labels: NDArray[np.int32]
@@ -58,6 +59,7 @@ class ObjectFrame:
     windows: dict[int, Window] = field(default_factory=dict)
     scores: dict[int, float] = field(default_factory=dict)
     new_ids: list[int] = field(default_factory=list)
+    carried_ids: set[int] = field(default_factory=set)
 
     def mask(self, object_id: int) -> NDArray[np.bool_]:
         """The object's pixels (h, w) inside its window."""
@@ -68,6 +70,7 @@ class ObjectFrame:
         window = self.windows.pop(object_id)
         self.labels[window][self.labels[window] == object_id] = 0
         del self.scores[object_id]
+        self.carried_ids.discard(object_id)
 
     def box_px(self, object_id: int) -> Array:
         """(4,) x1 y1 x2 y2, its first and last columns and rows."""

@@ -30,6 +30,7 @@ from pipelines.types import Array
 
 _MIN_CARRIED_POINTS = 6  # tracked points without which a mask is not carried on
 _MIN_CARRIED_SHARE = 0.3  # of a carried mask that no detection may cover
+_COLOR_NOISE = 0.5  # Hellinger distance of like things, times the root of the pixels compared
 
 
 def identify(
@@ -56,6 +57,8 @@ def identify(
     )
     boxes = np.array([tracks[i].fresh_box_px for i in ids]).reshape(len(ids), 4)
     colors = np.array([tracks[i].color for i in ids]).reshape(len(ids), instances.colors.shape[1])
+    away = color_distance(colors, instances.colors)
+    away -= _COLOR_NOISE / np.sqrt(np.maximum(instances.n_colored, 1))  # few pixels differ anyway
     kinds = same_kind([tracks[i].class_name for i in ids], [str(n) for n in instances.class_names])
     found = assign(
         Candidates(
@@ -64,7 +67,7 @@ def identify(
             box_overlap(boxes, instances.boxes_px),
             distance2,
             log_spread,
-            color_distance(colors, instances.colors),
+            np.maximum(away, 0.0),
             kinds,
         )
     )
@@ -80,7 +83,9 @@ def _distances(tracks: Mapping[int, ObjectTrack], centers_m: Array) -> tuple[Arr
         if track.filter is None:
             continue
         noise = track.center_sigma_m**2 * np.eye(3)
-        distance2[j, known], log_spread[j] = track.filter.distances2(centers_m[known], noise)
+        distance2[j, known], log_spread[j] = track.filter.distances2(
+            centers_m[known], noise, track.middle_offset_m
+        )
     return distance2, log_spread
 
 

@@ -16,6 +16,9 @@ from pipelines.types import Array
 _MAX_TURN_RADPS = 1.0  # faster turns are noise of small objects, and would curl their prediction
 _GATE = 11.3  # chi-square, 3 degrees of freedom, 99 %
 _TURN_MEMORY = 0.7  # share of the old turn rate that each measurement keeps
+_SPEEDING_MEMORY = 0.8  # and of the old change of speed
+_SPEEDING_LASTS_S = 1.0  # s, for which a change of speed goes on where nobody sees it
+_SURE_SPEED_MPS = 1.0  # m/s, standard deviation of a speed whose change says something
 
 
 class ObjectFilter:
@@ -26,6 +29,7 @@ class ObjectFilter:
     """
 
     _FIRST_SPEED_MPS = 15.0
+    _HIDDEN_SPEED_MPS = 5.0
 
     def __init__(self, center_m: Array, covariance_m2: Array, acceleration_mps2: float) -> None:
         from filterpy.kalman import KalmanFilter  # takes two seconds
@@ -36,6 +40,7 @@ class ObjectFilter:
         self._kf.P[:3, :3] = covariance_m2
         self._kf.P[3:, 3:] = self._FIRST_SPEED_MPS**2 * np.eye(3)
         self._acceleration = acceleration_mps2
+        self._speeding_mps2 = 0.0  # smoothed change of the speed, as it was last measured
         self.turn_radps = np.zeros(3)
 
     @property
@@ -77,6 +82,32 @@ class ObjectFilter:
         self._kf.P = R @ self._kf.P @ R.T
         self.turn_radps = C[:3, :3] @ self.turn_radps
 
+    def coast(self, dt_s: float, unmeasured_s: float) -> None:
+        """Move on by a time as what moves does when its motion is not measured, since a while.
+
+        What speeds up or brakes goes on so for a while, but never turns round. Accelerations that
+        nobody sees add up, as of a car that brakes: a speed is off by a t, a variance by (a t)^2.
+        """
+        speed = float(np.linalg.norm(self._kf.x[3:]))
+        if speed > 0.0:
+            change = self._speeding_mps2 * np.exp(-unmeasured_s / _SPEEDING_LASTS_S) * dt_s
+            self._kf.x[3:] *= max(0.0, 1.0 + change / speed)
+        self.predict(dt_s)
+        G = np.vstack([0.5 * dt_s * np.eye(3), np.eye(3)])
+        self._kf.P += self._acceleration**2 * 2.0 * unmeasured_s * dt_s * G @ G.T
+
+    def stay(self, dt_s: float) -> None:
+        """Move on by a time as what has no sure velocity: all of it becomes doubt.
+
+        But never more than `_HIDDEN_SPEED_MPS`: most of what is lost like this stands.
+        """
+        doubt = self.velocity_covariance + np.outer(self.velocity_mps, self.velocity_mps)
+        if np.trace(doubt) > 3.0 * self._HIDDEN_SPEED_MPS**2:
+            doubt = self._HIDDEN_SPEED_MPS**2 * np.eye(3)
+            self._kf.P[:3, 3:] = self._kf.P[3:, :3] = 0.0
+        self._kf.x[3:], self._kf.P[3:, 3:] = 0.0, doubt
+        self.predict(dt_s)
+
     def move_to(self, center_m: Array, covariance_m2: Array) -> None:
         """Put the centre (3,) elsewhere, with a covariance (3, 3); the velocity stays."""
         self._kf.x[:3] = center_m
@@ -105,6 +136,7 @@ class ObjectFilter:
         self.turn_radps = turn * min(1.0, _MAX_TURN_RADPS / max(float(np.linalg.norm(turn)), 1e-9))
         H = np.eye(6)
         H[3:, 3:] = rotation_of(self.turn_radps * (-0.5 * dt_s))
+        before, was_sure = self.velocity_mps, self.speed_std_mps < _SURE_SPEED_MPS
         z = np.r_[center_m, velocity_mps]
         residual, P = z - H @ self._kf.x, H @ self._kf.P @ H.T
         R = np.zeros((6, 6))
@@ -116,18 +148,26 @@ class ObjectFilter:
             distance2 = float(innovation @ np.linalg.solve(P[part, part] + covariance, innovation))
             R[part, part] = covariance * max(1.0, distance2 / _GATE)
         self._kf.update(z, R=R, H=H)
+        if was_sure:
+            change = float(np.linalg.norm(self.velocity_mps) - np.linalg.norm(before)) / dt_s
+            change = float(np.clip(change, -self._acceleration, self._acceleration))
+            self._speeding_mps2 += (1.0 - _SPEEDING_MEMORY) * (change - self._speeding_mps2)
 
     def update_center(self, center_m: Array, covariance_m2: Array) -> None:
-        """Take in a centre (3,) alone, where no motion could be measured."""
+        """Take in a centre (3,) alone, where no motion could be measured; wild ones count less."""
         H = np.hstack([np.eye(3), np.zeros((3, 3))])
-        self._kf.update(center_m, R=covariance_m2, H=H)
+        distance2 = float(self.distances2(center_m[None], covariance_m2)[0][0])
+        self._kf.update(center_m, R=covariance_m2 * max(1.0, distance2 / _GATE), H=H)
 
-    def distances2(self, centers_m: Array, covariance_m2: Array) -> tuple[Array, float]:
+    def distances2(
+        self, centers_m: Array, covariance_m2: Array, offset_m: Array | None = None
+    ) -> tuple[Array, float]:
         """Squared Mahalanobis distances (M,) of centres (M, 3) seen with a covariance (3, 3).
 
-        And the logarithm of the determinant of their covariance, in m^6.
+        offset_m: (3,) of what is seen from the filter's own centre, none where None. Answers also
+        the logarithm of the determinant of their covariance, in m^6.
         """
-        d = centers_m - self._kf.x[:3]
+        d = centers_m - self._kf.x[:3] - (0.0 if offset_m is None else offset_m)
         S = self._kf.P[:3, :3] + covariance_m2
         return (
             np.einsum("mi,mi->m", d, np.linalg.solve(S, d.T).T),

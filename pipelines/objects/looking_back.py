@@ -31,16 +31,15 @@ def seed_pixels(
     its mask, so that it has a motion in its very first frame. What stood before it or beside it
     then is left out.
     """
-    H, W = flow_px.shape[:2]
-    v, u = np.mgrid[0:H:_GRID_PX, 0:W:_GRID_PX]
-    to = np.nan_to_num(flow_px[::_GRID_PX, ::_GRID_PX], nan=1e6, posinf=1e6, neginf=1e6)
-    x, y = np.rint(u + to[..., 0]).astype(np.int64), np.rint(v + to[..., 1]).astype(np.int64)
-    inside = (x >= 0) & (y >= 0) & (x < W) & (y < H)
-    label = np.where(inside, frame.labels[np.clip(y, 0, H - 1), np.clip(x, 0, W - 1)], 0)
+    to = flow_px[::_GRID_PX, ::_GRID_PX]
+    v, u = np.mgrid[0 : to.shape[0], 0 : to.shape[1]].astype(np.float32) * _GRID_PX
+    x, y = u + to[..., 0], v + to[..., 1]
+    x[~(np.isfinite(x) & np.isfinite(y))] = -1e6  # out of the image, where there is no label
+    label = cv2.remap(frame.labels.astype(np.float32), x, y, cv2.INTER_NEAREST)
     before = last.labels[::_GRID_PX, ::_GRID_PX].astype(np.float32)
     before = cv2.dilate(before, np.ones((_SHY_NODES, _SHY_NODES), np.uint8))
     label[(before > 0) & (before != label)] = 0
-    pixels = [_pixels_on_grid(last.view, label == i, n_each) for i in frame.new_ids]
+    pixels = [_pixels_on_grid(last.view, label == np.float32(i), n_each) for i in frame.new_ids]
     ids = np.repeat(np.array(frame.new_ids, np.int64), [len(p) for p in pixels])
     return ids, np.concatenate([np.empty((0, 2)), *pixels])
 
@@ -65,7 +64,7 @@ def guess_motions(
     guesses: dict[int, Array] = {}
     for object_id in frame.windows:
         before = last.mask(object_id)
-        if object_id in solved or before is None or frame.scores[object_id] == 0.0:
+        if object_id in solved or before is None or object_id in frame.carried_ids:
             continue
         mask = frame.mask(object_id)
         if min(np.count_nonzero(before[0]), np.count_nonzero(mask)) < _MIN_SEARCH_PX:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pipelines.frontend.hypotheses import estimate_pnp, reprojection_inliers
 from pipelines.frontend.motion_only_ba import estimate_poses
 from pipelines.geometry import (
+    exp_se3,
     invert_T,
     make_T,
     reprojection_errors,
@@ -156,30 +157,30 @@ def move_points(Gs: Array, points_m: Array, sizes: NDArray[np.int64]) -> Array:
 
 
 def motion_in_world(G_curr_prev: Array, T_world_curr: Array, T_world_prev: Array) -> Array:
-    """H_world_curr_prev (4, 4) of a motion seen from a moving camera: X_k G inv(X_k-1)."""
+    """H_world_curr_prev (..., 4, 4) of motions seen from a moving camera: X_k G inv(X_k-1)."""
     return T_world_curr @ G_curr_prev @ invert_T(T_world_prev)
 
 
 def world_covariance(covariance: Array, T_world_curr: Array, center_m: Array) -> Array:
-    """Covariance (6, 6) of a motion in the world, from that of `Motions` (6, 6).
+    """Covariances (..., 6, 6) of motions in the world, from those of `Motions` (..., 6, 6).
 
-    The answer is of [omega rad, v m], the left perturbation of H about the object's centre (3,) in
-    the world, after the motion: v is how far that centre is put wrong.
+    The answer is of [omega rad, v m], the left perturbation of H about the object's centre (..., 3)
+    in the world, after the motion: v is how far that centre is put wrong.
     """
     R = T_world_curr[:3, :3]
     lever = center_m - T_world_curr[:3, 3]
     # inv(G) exp(xi) means exp(-xi) before the camera: H <- X exp(-xi) inv(X) H
-    A = np.zeros((6, 6))
-    A[:3, :3] = -R
-    A[3:, 3:] = -R
-    A[3:, :3] = skew(lever) @ R
-    return A @ covariance @ A.T
+    A = np.zeros((*lever.shape[:-1], 6, 6))
+    A[..., :3, :3] = -R
+    A[..., 3:, 3:] = -R
+    A[..., 3:, :3] = skew(lever) @ R
+    return A @ covariance @ np.swapaxes(A, -1, -2)
 
 
 def displacement(H_world_curr_prev: Array, center_m: Array) -> Array:
-    """How far (3,) m a motion takes an object's centre: t - (I - R) c, eq. (6) of the paper."""
-    R, t = H_world_curr_prev[:3, :3], H_world_curr_prev[:3, 3]
-    return t - (np.eye(3) - R) @ center_m
+    """How far (..., 3) m motions take objects' centres: t - (I - R) c, eq. (6) of the paper."""
+    R, t = H_world_curr_prev[..., :3, :3], H_world_curr_prev[..., :3, 3]
+    return t - ((np.eye(3) - R) @ center_m[..., None])[..., 0]
 
 
 def scale_about(H_world_curr_prev: Array, center_m: Array, share: float) -> Array:
@@ -193,14 +194,14 @@ def scale_about(H_world_curr_prev: Array, center_m: Array, share: float) -> Arra
 
 @dataclass(frozen=True, slots=True)
 class FusedMotion:
-    """A motion (4, 4) with its covariance (6, 6), as of `world_covariance`.
+    """Motions (..., 4, 4) with their covariances (..., 6, 6), as of `world_covariance`.
 
-    distance2: squared Mahalanobis distance of what was measured from what was expected.
+    distance2: (...,) squared Mahalanobis distances of what was measured from what was expected.
     """
 
     H_world_curr_prev: Array
     covariance: Array
-    distance2: float
+    distance2: Array
 
 
 def fuse_motions(
@@ -210,42 +211,49 @@ def fuse_motions(
     measured_covariance: Array,
     center_m: Array,
 ) -> FusedMotion:
-    """The motion between an expected (4, 4) and a measured one (4, 4).
+    """The motions between expected (..., 4, 4) and measured ones (..., 4, 4), all at once.
 
-    Covariances as of `world_covariance`. center_m: (3,) the object's centre before the motion. One
-    step of a Kalman filter: matter does not change its motion at once. A measurement outside its
-    99 % gate is answered as it is, and whether to believe it is left to who asked.
+    Covariances as of `world_covariance`. center_m: (..., 3) the objects' centres before the motion.
+    One step of a Kalman filter: matter does not change its motion at once. A measurement outside
+    its 99 % gate is answered as it is, and whether to believe it is left to who asked.
     Deviation: the paper keeps the measured motion. This changes it only where it is less certain
     than the expectation, as with few or far points.
     """
-    turn = rotation_vector(H_measured[:3, :3] @ H_expected[:3, :3].T)
+    P, R_expected = expected_covariance, H_expected[..., :3, :3]
+    turn = rotation_vector(H_measured[..., :3, :3] @ np.swapaxes(R_expected, -1, -2))
     way_m = displacement(H_expected, center_m)
-    innovation = np.r_[turn, displacement(H_measured, center_m) - way_m]
-    S = expected_covariance + measured_covariance
-    distance2 = float(innovation @ np.linalg.solve(S, innovation))
-    if distance2 > GATE_6DOF:
-        return FusedMotion(H_measured, measured_covariance, distance2)
-    gain = np.linalg.solve(S, expected_covariance).T
-    step = gain @ innovation
-    R = rotation_of(step[:3]) @ H_expected[:3, :3]
-    covariance = (np.eye(6) - gain) @ expected_covariance
+    innovation = np.concatenate([turn, displacement(H_measured, center_m) - way_m], -1)
+    S = P + measured_covariance
+    # [inv(S) P, inv(S) innovation], one solution for both
+    solved = np.linalg.solve(S, np.concatenate([P, innovation[..., None]], -1))
+    distance2 = (innovation * solved[..., 6]).sum(-1)
+    gain = np.swapaxes(solved[..., :6], -1, -2)
+    step = (gain @ innovation[..., None])[..., 0]
+    fused = np.zeros_like(H_measured)
+    turn_only = step * (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+    R = exp_se3(turn_only)[..., :3, :3] @ R_expected
+    fused[..., :3, :3], fused[..., 3, 3] = R, 1.0
+    fused[..., :3, 3] = center_m + way_m + step[..., 3:] - (R @ center_m[..., None])[..., 0]
+    covariance = (np.eye(6) - gain) @ P
+    covariance = 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
+    wild = np.asarray(distance2 > GATE_6DOF)[..., None, None]
     return FusedMotion(
-        make_T(R, center_m + way_m + step[3:] - R @ center_m),
-        0.5 * (covariance + covariance.T),
+        np.where(wild, H_measured, fused),
+        np.where(wild, measured_covariance, covariance),
         distance2,
     )
 
 
-def points_std(covariance: Array, spread_m: float) -> float:
-    """How far, in m, a motion with a covariance (6, 6) may put an object's points wrong.
+def points_std(covariance: Array, spread_m: Array) -> Array:
+    """How far (...,), in m, motions with covariances (..., 6, 6) may put objects' points wrong.
 
-    spread_m: root mean square distance of the points from the object's centre. Along the worst
-    direction, of the centre and of what a wrong turn adds.
+    spread_m: (...,) root mean square distance of the points from the object's centre. Along the
+    worst direction, of the centre and of what a wrong turn adds.
     """
-    way, turn = largest_std(covariance[3:, 3:]), largest_std(covariance[:3, :3])
-    return float(np.hypot(way, turn * spread_m))
+    way, turn = largest_std(covariance[..., 3:, 3:]), largest_std(covariance[..., :3, :3])
+    return np.hypot(way, turn * spread_m)
 
 
-def largest_std(covariance: Array) -> float:
-    """Standard deviation along the worst direction of a covariance (3, 3)."""
-    return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
+def largest_std(covariance: Array) -> Array:
+    """Standard deviations (...,) along the worst direction of covariances (..., 3, 3)."""
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[..., -1], 0.0))

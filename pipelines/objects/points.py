@@ -33,13 +33,15 @@ class ObjectPoints:
     """Points on objects (parallel arrays of length N), those of one object in a row.
 
     object_id: (N,) int64, ascending. position_m: (N, 3) in the camera of the last frame, with
-    covariance_m2: (N, 3, 3). uv_px: (N, 2) where that frame saw them.
+    covariance_m2: (N, 3, 3). uv_px: (N, 2) where that frame saw them. track_id: (N,) int64, the
+    point's lasting number, never used twice.
     """
 
     object_id: NDArray[np.int64]
     position_m: Array
     covariance_m2: Array
     uv_px: Array
+    track_id: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.object_id)
@@ -55,7 +57,8 @@ class ObjectPoints:
     @classmethod
     def empty(cls) -> ObjectPoints:
         """No points at all."""
-        return cls(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 2)))
+        ids, two = np.empty(0, np.int64), np.empty((0, 2))
+        return cls(ids, np.empty((0, 3)), np.empty((0, 3, 3)), two, ids)
 
     @classmethod
     def concatenate(cls, *parts: ObjectPoints) -> ObjectPoints:
@@ -72,17 +75,20 @@ def create_points(
     uv_px: Array,
     sigma_disparity_px: float,
     min_disparity_px: float,
+    first_track_id: int = 0,
 ) -> ObjectPoints:
     """Points at pixels (N, 2) of objects (N,), by their disparities; those without one are left.
 
     disparity_px: (H, W) of the same frame, with its noise. min_disparity_px: less says no depth.
+    They are numbered from `first_track_id` on.
     """
     disparity = sample_disparity(disparity_px, uv_px, sigma_disparity_px)
     good = disparity >= min_disparity_px
     uv, disparity, owner = uv_px[good], disparity[good], object_id[good]
     sigma = np.full(len(uv), sigma_disparity_px)
     points, covariances = make_points(camera, np.eye(4), uv, disparity, _SIGMA_NEW_UV_PX, sigma)
-    return ObjectPoints(owner, points, covariances, uv)
+    track_id = first_track_id + np.arange(len(uv))
+    return ObjectPoints(owner, points, covariances, uv, track_id)
 
 
 def points_wanted(area_px: int, max_points: int) -> int:

@@ -41,6 +41,11 @@ class Solution:
     motions: Motions
     accepted: NDArray[np.bool_]
 
+    @property
+    def agrees(self) -> NDArray[np.bool_]:
+        """(N,) which points agree with an accepted motion."""
+        return self.motions.inliers & np.repeat(self.accepted, self.motions.n_points)
+
     def rows_of(self, j: int) -> NDArray[np.int64]:
         """Rows of the points of object `j`."""
         end = int(self.motions.n_points[: j + 1].sum())
@@ -52,6 +57,7 @@ class MotionSolver:
 
     def __init__(self, sensor: Sensor, config: ObjectsConfig, seed: int) -> None:
         self.sensor, self.config, self.camera, self._seed = sensor, config, sensor.camera, seed
+        self._next_track_id = 0
 
     def create_points(
         self, disparity_px: NDArray[np.float32], object_id: NDArray[np.int64], uv_px: Array
@@ -66,7 +72,9 @@ class MotionSolver:
             uv_px[order],
             sigma,
             self.sensor.min_disparity_px,
+            self._next_track_id,
         )
+        self._next_track_id += len(points)
         return points[on_one_surface(self.camera, points, sigma)]
 
     def solve(
@@ -101,7 +109,7 @@ class MotionSolver:
     def _learn_noise(self, followed: Followed, solution: Solution) -> None:
         """Each source's own residuals at the inliers teach its noise."""
         motions = solution.motions
-        good = motions.inliers & np.repeat(solution.accepted, motions.n_points)
+        good = solution.agrees
         predicted = followed.uv_px - motions.residuals_px[:, :2]
         sources = {"object_flow": followed.flow_px, "object_alignment": followed.aligned_px}
         for source, uv in sources.items():
@@ -110,8 +118,7 @@ class MotionSolver:
 
     def refine(self, solution: Solution) -> ObjectPoints:
         """The agreeing points in the present camera, each refined by what was seen of it."""
-        points, motions = solution.points, solution.motions
-        good = motions.inliers & np.repeat(solution.accepted, motions.n_points)
+        points, motions, good = solution.points, solution.motions, solution.agrees
         if not good.any():
             return ObjectPoints.empty()
         moved = move_points(motions.Gs_curr_prev, points.position_m, motions.n_points)
@@ -125,7 +132,10 @@ class MotionSolver:
         positions, covariances, _ = refine_points(
             self.camera, np.eye(4), pose, seen, np.zeros((len(seen), 3))
         )
-        return ObjectPoints(points.object_id[good], positions, covariances, seen.uvr_px[:, :2])
+        uv = seen.uvr_px[:, :2]
+        return ObjectPoints(
+            points.object_id[good], positions, covariances, uv, points.track_id[good]
+        )
 
     def guess_by_matches(
         self, disparity_prev_px: NDArray[np.float32], uv_prev_px: Array, uv_px: Array

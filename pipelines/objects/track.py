@@ -26,10 +26,13 @@ from pipelines.objects.motion import scale_about
 from pipelines.types import Array
 
 _COLOR_MEMORY = 0.8  # share of the old colours that each frame keeps
-_STRAY_SHARE = 0.04  # of the points at each end, left out so that strays do not blow up the box
+# Of the points at each end, one at least: left out so that strays do not blow up the box
+_STRAY_SHARE, _FEW_POINTS = 0.04, 8
 _GROWTH = 0.6  # of the way to them by which the box grows in a frame, for the same reason
 _SEEN_SIGMA_M = 1.0  # the middle of a mask, at its median depth
 _PART_SHARE = 0.35  # of its size, the same where a part of it may be hidden
+_LARGEST_PART_M = 1.75  # of anything: four of it are half of a bus; far boxes are too long
+_MIDDLE_SHARE, _LARGEST_OFF_M = 0.12, 0.6  # of its size, how far its seen middle is off its own
 _SHRINKING = 0.98  # share of its size that it keeps from frame to frame at least
 _LEAST_SPEED_MPS = 0.1  # m/s over ground, of a velocity that has a direction
 _MAX_SLIP_S = 0.5  # s without a measured motion after which nobody knows where its box is
@@ -47,7 +50,8 @@ class ObjectTrack:
     missed_s: for how long detections have gone without it; unconfirmed_s: the same, frames without
     any detections counted. still_since_s: None unless stopped. box_px, area_px, color: of its last
     mask. low_m, high_m: (3,) box around its points in the axes of its pose, NaN where that is not
-    known; extent_m: (3,) its size, also after that.
+    known; middle_m: (3,) the middle and extent_m: (3,) the size of that box, also after that.
+    surely_moves: whether the filter had it moving when its motion was last measured.
     """
 
     object_id: int
@@ -69,7 +73,9 @@ class ObjectTrack:
     color: Array = field(default_factory=lambda: np.zeros(64))
     low_m: Array = field(default_factory=lambda: np.full(3, np.nan))
     high_m: Array = field(default_factory=lambda: np.full(3, np.nan))
+    middle_m: Array = field(default_factory=lambda: np.zeros(3))
     extent_m: Array = field(default_factory=lambda: np.full(3, np.nan))
+    surely_moves: bool = False
 
     # ---------------------------------------------------------------- answers
 
@@ -88,6 +94,13 @@ class ObjectTrack:
         return self.T_world_object[:3, :3] @ middle + self.T_world_object[:3, 3]
 
     @property
+    def middle_offset_m(self) -> Array:
+        """(3,) in the world, of the middle of its matter from the filter's centre."""
+        if self.T_world_object is None:
+            return np.zeros(3)
+        return self.T_world_object[:3, :3] @ self.middle_m
+
+    @property
     def fresh_box_px(self) -> Array:
         """(4,) its last box, NaN where it was missed for so long that it will be elsewhere."""
         return self.box_px if self.missed_s <= self.config.max_carried_s else np.full(4, np.nan)
@@ -101,17 +114,6 @@ class ObjectTrack:
     def has_motion(self) -> bool:
         """Whether a motion of it was ever measured, be it none at all."""
         return self.H_dt_s > 0.0
-
-    @property
-    def surely_moves(self) -> bool:
-        """Whether its filter, taught by a measured motion, has it moving, whatever came last."""
-        if self.filter is None or not self.has_motion:
-            return False
-        speed_mps = float(np.linalg.norm(self.filter.velocity_mps))
-        return (
-            speed_mps - self.config.significance * self.filter.speed_std_mps
-            > self.config.min_speed_mps
-        )
 
     def velocity_at(self, point_m: Array) -> Array:
         """(3,) m/s of the object's matter at a point (3,) in the world, by the filter.
@@ -130,7 +132,17 @@ class ObjectTrack:
         """Standard deviation along the filter's velocity, NaN where that is not told."""
         if self.filter is None or not self.has_motion:
             return np.nan
-        return self.filter.speed_std_mps
+        turn_radps = float(np.linalg.norm(self.filter.turn_radps))
+        return float(np.hypot(self.filter.speed_std_mps, self.middle_doubt_mps(turn_radps)))
+
+    def middle_doubt_mps(self, turn_radps: float) -> float:
+        """Standard deviation of its speed by not knowing where its middle is, while it turns.
+
+        Only sides of it are seen, so that the middle of what is seen lies off its own; where it
+        turns, each place of it has another speed. This error is the same in frame after frame.
+        """
+        size_m = float(np.nan_to_num(self.extent_m).max())
+        return turn_radps * min(_MIDDLE_SHARE * size_m, _LARGEST_OFF_M)
 
     def is_landmark(self, timestamp_s: float) -> bool:
         """Whether it has been still for so long that it serves the camera as the world does."""
@@ -180,6 +192,17 @@ class ObjectTrack:
 
     # ---------------------------------------------------------------- changes
 
+    def predict(self, dt_s: float) -> None:
+        """Move the filter on to the next frame, before anything is known of that."""
+        if self.filter is None:
+            return
+        if self.surely_moves and self.unmeasured_s > 0.0:
+            self.filter.coast(dt_s, self.unmeasured_s)
+        elif not self.surely_moves and self.unconfirmed_s > 0.0:
+            self.filter.stay(dt_s)  # what never surely moved is looked for where it was
+        else:
+            self.filter.predict(dt_s)
+
     def take_detection(self, name: str, score: float, color: Array) -> None:
         """Take in what a detection says of its class and colours (64,)."""
         self.scores[name] = self.scores.get(name, 0.0) + max(score, 1e-3)
@@ -194,6 +217,7 @@ class ObjectTrack:
             R = np.eye(3) if self.T_world_object is None else self.T_world_object[:3, :3]
             self.T_world_object = invert_T(H) @ make_T(H[:3, :3] @ R, center_m)
             self.low_m, self.high_m = np.full(3, np.nan), np.full(3, np.nan)
+            self.middle_m = np.zeros(3)
         assert self.T_world_object is not None
         before = self.T_world_object[:3, 3]
         self.T_world_object = orthonormalise(H @ self.T_world_object)
@@ -212,11 +236,15 @@ class ObjectTrack:
         )  # fmt: skip
         self.H_world_curr_prev, self.H_dt_s, self.H_covariance = H, dt_s, covariance
         self.unmeasured_s = 0.0
+        speed_mps = float(np.linalg.norm(self.filter.velocity_mps))
+        doubt_mps = self.config.significance * self.filter.speed_std_mps
+        self.surely_moves = speed_mps - doubt_mps > self.config.min_speed_mps
 
     @property
     def center_sigma_m(self) -> float:
         """How far the middle of what is seen of it may be off: any part of it may be hidden."""
-        return max(_SEEN_SIGMA_M, _PART_SHARE * float(np.nan_to_num(self.extent_m).max()))
+        size_m = float(np.nan_to_num(self.extent_m).max())
+        return min(max(_SEEN_SIGMA_M, _PART_SHARE * size_m), _LARGEST_PART_M)
 
     def take_center(self, center_m: Array) -> None:
         """Take in where the middle (3,) of what is seen of it lies, where there is no motion.
@@ -232,6 +260,7 @@ class ObjectTrack:
             return
         self.filter.update_center(center_m, covariance)
         self._follow_filter()
+        self.middle_m = np.zeros(3)  # the filter follows what is seen from here on
 
     def coast(self, dt_s: float) -> None:
         """Go on without a measured motion; the filter has been moved on already."""
@@ -250,6 +279,7 @@ class ObjectTrack:
         self.T_world_object[:3, 3] += slip_m
         shift = self.T_world_object[:3, :3].T @ slip_m
         self.low_m, self.high_m = self.low_m - shift, self.high_m - shift
+        self.middle_m = self.middle_m - shift
 
     def set_state(self, state: ObjectState, timestamp_s: float) -> None:
         """Change the state; a stopped object remembers since when it is."""
@@ -271,20 +301,26 @@ class ObjectTrack:
         if length < _LEAST_SPEED_MPS:
             return
         x, _, z = forward / length
+        offset_m = self.middle_offset_m
         self.T_world_object = make_T(
             np.array([[x, 0.0, -z], [0.0, 1.0, 0.0], [z, 0.0, x]]), self.T_world_object[:3, 3]
         )
+        self.middle_m = self.T_world_object[:3, :3].T @ offset_m
         self.low_m, self.high_m = np.full(3, np.nan), np.full(3, np.nan)
 
     def take_points(self, points_world_m: Array) -> None:
-        """Widen the box by the points (N, 3) seen now."""
+        """Widen the box by the points (N, 3) seen now.
+
+        Of a pose that is not tied to the matter the box is that of these points alone.
+        """
         assert self.T_world_object is not None
         local = transform_points(invert_T(self.T_world_object), points_world_m)
         ordered = np.sort(local, axis=0)
-        left_out = int(_STRAY_SHARE * len(ordered))
+        left_out = int(np.ceil(_STRAY_SHARE * len(ordered))) if len(ordered) >= _FEW_POINTS else 0
         low, high = ordered[left_out], ordered[-1 - left_out]
-        if np.isnan(self.low_m).any():
+        if np.isnan(self.low_m).any() or not self.is_anchored:
             self.low_m, self.high_m = low, high
         self.low_m = self.low_m + _GROWTH * np.minimum(low - self.low_m, 0.0)
         self.high_m = self.high_m + _GROWTH * np.maximum(high - self.high_m, 0.0)
+        self.middle_m = 0.5 * (self.low_m + self.high_m)
         self.extent_m = np.fmax(self.high_m - self.low_m, _SHRINKING * self.extent_m)

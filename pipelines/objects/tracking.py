@@ -12,36 +12,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import ObjectsConfig
+from pipelines.frame_observations import Sightings
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
-from pipelines.geometry import MIN_DEPTH_M, backproject, invert_T, project_stereo, transform_points
+from pipelines.geometry import (
+    MIN_DEPTH_M,
+    invert_T,
+    project_stereo,
+    transform_points,
+)
 from pipelines.object_types import UNNAMED_CLASS, Detections, ObjectEstimates, ObjectState
 from pipelines.objects.following import Followed, follow_points
 from pipelines.objects.frame import LastObjects, ObjectFrame
 from pipelines.objects.identification import carry_missed, identify
-from pipelines.objects.instances import Instances, describe_instances
-from pipelines.objects.kalman import direction_std
-from pipelines.objects.looking_back import guess_motions, seed_pixels
-from pipelines.objects.motion import (
-    GATE_6DOF,
-    displacement,
-    fuse_motions,
-    largest_std,
-    motion_in_world,
-    move_points,
-    points_std,
-    world_covariance,
+from pipelines.objects.instances import (
+    Instances,
+    describe_instances,
+    middle_of_pixels,
+    relabelled,
+    some_pixels,
 )
-from pipelines.objects.motion_state import decide_by_scene_flow, decide_by_speed
+from pipelines.objects.looking_back import guess_motions, seed_pixels
+from pipelines.objects.motion import move_points
+from pipelines.objects.motion_intake import MotionIntake
 from pipelines.objects.points import ObjectPoints, choose_pixels, points_wanted
 from pipelines.objects.rows import RowTable
+from pipelines.objects.sightings import collect_sightings
 from pipelines.objects.solver import MotionSolver, Solution
 from pipelines.objects.track import ObjectTrack
-from pipelines.observations import StereoObservations
 from pipelines.types import Array
 
-_SURE_SHARE = 0.6  # of the points that must agree with a motion that nobody expected
-_LASTING_SHARE = 0.5  # of a speed's error stays from frame to frame, as its points do
 _MOSTLY_SEEN = 0.6  # of its last mask, below which a mask does not say where an object is
 _ENOUGH = 0.8  # of the points wanted on an object, above which no new ones are taken
 _SURE_SPEED_MPS = 1.0  # m/s, standard deviation of a speed by which points may be expected
@@ -56,6 +56,7 @@ class ObjectTracker:
         self._solver = MotionSolver(sensor, config, seed)
         self._last: LastObjects | None = None
         self._next_id = 1
+        self.sightings = Sightings.empty()  # of the last frame, for the observation log
 
     # ----------------------------------------------------------- association
 
@@ -75,8 +76,7 @@ class ObjectTracker:
             return ObjectFrame(seen.labels, detections is not None, *nothing, False)
         dt_s = self._time_since_last(view)
         for track in self.tracks.values():
-            if track.filter is not None:
-                track.filter.predict(dt_s)
+            track.predict(dt_s)
         last_points = ObjectPoints.empty() if self._last is None else self._last.points
         followed = self._follow(view, last_points, T_predicted)
         answered = detections is not None
@@ -117,6 +117,7 @@ class ObjectTracker:
         again = identify(lost, instances, frame.points, frame.followed, T_world_camera)
         found |= {i: m for i, m in again.items() if labels[m] not in frame.windows}
         frame.windows, frame.new_ids = {}, [i for i in frame.new_ids if i in found]
+        frame.carried_ids &= set(found)
         scores, frame.scores = frame.scores, {}
         painted = self._paint(frame, instances, found, scores)
         self._keep_points_in_sight(frame)
@@ -153,13 +154,14 @@ class ObjectTracker:
                 nameless = str(instances.class_names[m]) == UNNAMED_CLASS
                 score = score if nameless else scores[object_id]
                 if nameless:  # geometry drops what it does not see
+                    frame.carried_ids.discard(object_id)
                     self.tracks[object_id].unconfirmed_s = 0.0
             else:
                 self.tracks[object_id].take_detection(
                     str(instances.class_names[m]), score, instances.colors[m]
                 )
             frame.windows[object_id], frame.scores[object_id] = window, score
-        frame.labels = table[instances.labels]
+        frame.labels = relabelled(instances.labels, table)
         return [int(i) for i in table[1:]]
 
     def _carry(self, frame: ObjectFrame, object_id: int, dt_s: float) -> None:
@@ -173,6 +175,7 @@ class ObjectTracker:
         window = carry_missed(self.config, track, self._last, frame.followed, frame.labels)
         if window is not None:
             frame.windows[object_id], frame.scores[object_id] = window, 0.0
+            frame.carried_ids.add(object_id)
 
     def _keep_points_in_sight(self, frame: ObjectFrame) -> None:
         """Drop the points that are lost, behind another object, or of an object out of sight."""
@@ -263,19 +266,30 @@ class ObjectTracker:
         is_tracked = bool(np.isfinite(pose_covariance).all())
         measured_ids: set[int] = set()
         if is_tracked and self._last is not None and self._last.is_tracked:
+            intake = MotionIntake(
+                self.camera, self.config, self._last, view, T_world_camera, pose_covariance
+            )
             for solution in solutions:
-                for j in np.flatnonzero(solution.accepted):
-                    if self._take_motion(
-                        table, view, frame, solution, int(j), T_world_camera, pose_covariance
-                    ):
-                        measured_ids.add(int(solution.motions.object_id[j]))
+                measured_ids.update(intake.take(solution, self.tracks, frame, table))
         self._take_rest(table, view, frame, measured_ids, T_world_camera)
         moved = [self._solver.refine(solution) for solution in solutions]
         points = self._renew_points(view, frame, T_world_camera, ObjectPoints.concatenate(*moved))
+        self._note_sightings(view, solutions, moved, points)
         self._last = LastObjects(
             view, T_world_camera, is_tracked, frame.labels, dict(frame.windows), points
         )
         return table.estimates()
+
+    def _note_sightings(
+        self, view: View, solutions: list[Solution], moved: list[ObjectPoints], points: ObjectPoints
+    ) -> None:
+        last = self._last
+        before = ObjectPoints.empty() if last is None else last.points
+        frames = (-1 if last is None else last.view.frame_index, view.frame_index)
+        sigma = self.sensor.noise.sigma_disparity_px
+        self.sightings = collect_sightings(
+            self.camera, frames, solutions, moved, before, points, sigma
+        )
 
     def _solve(self, view: View, frame: ObjectFrame, T_world_camera: Array) -> list[Solution]:
         """Eq. (3) for all objects in sight, and once more for those that flow has lost."""
@@ -331,102 +345,6 @@ class ObjectTracker:
             Followed.concatenate(frame.followed, followed)[np.argsort(owners, kind="stable")],
         )
 
-    def _take_motion(
-        self,
-        table: RowTable,
-        view: View,
-        frame: ObjectFrame,
-        solution: Solution,
-        j: int,
-        T_world_camera: Array,
-        pose_covariance: Array,
-    ) -> bool:
-        """A solved motion into the object's filter, pose and state; False if too uncertain."""
-        assert self._last is not None
-        dt_s = self._time_since_last(view)
-        motions, rows = solution.motions, solution.rows_of(j)
-        good = motions.inliers[rows]
-        points, observations = solution.points[rows][good], solution.observations[rows][good]
-        track = self.tracks[int(motions.object_id[j])]
-        H = motion_in_world(motions.Gs_curr_prev[j], T_world_camera, self._last.T_world_camera)
-        center_prev = track.box_center_m
-        if center_prev is None:
-            center_prev = transform_points(self._last.T_world_camera, points.position_m).mean(0)
-        covariance = world_covariance(
-            motions.covariances[j] + pose_covariance,
-            T_world_camera,
-            center_prev + displacement(H, center_prev),
-        )
-        fused = fuse_motions(*track.expected_motion(center_prev, dt_s), H, covariance, center_prev)
-        if fused.distance2 > GATE_6DOF:
-            sure = good.mean() >= _SURE_SHARE and good.sum() >= 2 * self.config.min_points
-            if track.H_world_curr_prev is None or not sure:
-                return False  # nothing moves like this, or hardly any point says so
-        H, covariance = fused.H_world_curr_prev, fused.covariance
-        spread_m = float(np.sqrt(points.position_m.var(0).sum()))
-        if not self._is_certain(covariance, spread_m, dt_s):
-            return False
-        way_m = displacement(H, center_prev)
-        center = center_prev + way_m
-        std_mps = direction_std(way_m, covariance[3:, 3:]) / dt_s
-        is_first = not track.has_motion
-        track.take_motion(H, covariance, center, dt_s)
-        if self.config.motion_rule == "scene_flow":
-            state = decide_by_scene_flow(
-                self.config, self._scene_flow(points, observations, T_world_camera)
-            )
-        else:
-            state = self._state_by_speed(track, covariance, spread_m, std_mps, dt_s)
-        track.set_state(state, view.timestamp_s)
-        if is_first and state is ObjectState.MOVING:
-            track.orient()
-        score = frame.scores[track.object_id]
-        depth_m = float(np.median(points.position_m[:, 2]))
-        if 0.0 < self.config.max_depth_m < depth_m:
-            table.add(track, score, center_m=center, state=ObjectState.UNKNOWN)
-            return True
-        table.add(
-            track,
-            score,
-            n_points=int(motions.n_inliers[j]),
-            H_world_curr_prev=H,
-            motion_covariance=covariance,
-            center_m=center,
-            speed_mps=float(np.linalg.norm(way_m)) / dt_s,  # eq. (6)
-            speed_std_mps=std_mps,
-        )
-        return True
-
-    def _is_certain(self, covariance: Array, spread_m: float, dt_s: float) -> bool:
-        """Whether a motion with a covariance (6, 6) is worth telling; no wild estimates go out."""
-        if largest_std(covariance[:3, :3]) > np.radians(self.config.max_turn_std_deg):
-            return False
-        return points_std(covariance, spread_m) <= self.config.max_speed_std_mps * dt_s
-
-    def _state_by_speed(
-        self, track: ObjectTrack, covariance: Array, spread_m: float, std_mps: float, dt_s: float
-    ) -> ObjectState:
-        """State by the speed of the object's points: of its centre, and of its sure turning."""
-        assert track.filter is not None
-        turn_std = largest_std(covariance[:3, :3]) / dt_s
-        turn = float(np.linalg.norm(track.filter.turn_radps))
-        sure_turn = max(0.0, turn - self.config.significance * turn_std)
-        speed = float(np.linalg.norm(track.filter.velocity_mps)) + sure_turn * spread_m
-        std = float(np.hypot(track.filter.speed_std_mps, _LASTING_SHARE * std_mps))
-        return decide_by_speed(self.config, track.state, speed, std)
-
-    def _scene_flow(
-        self, points: ObjectPoints, observations: StereoObservations, T_world_camera: Array
-    ) -> Array:
-        """f = X_k p_k - X_k-1 p_k-1 (N, 3) in m, of the points whose depth is measured now."""
-        assert self._last is not None
-        uvr = observations.uvr_px
-        z = self.camera.bf / (uvr[:, 0] - uvr[:, 2])
-        known = np.isfinite(z)
-        now = backproject(self.camera, uvr[known, :2], z[known])
-        before = transform_points(self._last.T_world_camera, points.position_m[known])
-        return transform_points(T_world_camera, now) - before
-
     # ------------------------------------------------------------------ rest
 
     def _take_rest(
@@ -440,7 +358,7 @@ class ObjectTracker:
         """Objects without a motion in this frame: in sight, coasting, or to be forgotten."""
         t, dt_s = view.timestamp_s, self._time_since_last(view)
         for object_id, track in list(self.tracks.items()):
-            carried = frame.scores.get(object_id) == 0.0
+            carried = object_id in frame.carried_ids
             if carried and frame.answered and object_id not in measured_ids:
                 frame.remove(object_id)  # no detection and no motion bears it out
             in_sight = object_id in frame.windows
@@ -455,7 +373,8 @@ class ObjectTracker:
                 del self.tracks[object_id]
             elif track.state in (ObjectState.MOVING, ObjectState.COASTING) or track.surely_moves:
                 track.set_state(ObjectState.COASTING, t)
-                table.add(track, np.nan, center_m=track.filter.center_m, box_px=np.full(4, np.nan))
+                center = track.filter.center_m + track.middle_offset_m
+                table.add(track, np.nan, center_m=center, box_px=np.full(4, np.nan))
 
     def _see_without_motion(
         self,
@@ -466,17 +385,14 @@ class ObjectTracker:
         T_world_camera: Array,
     ) -> None:
         """Too small, too far, or too uncertain: where it is may still be known."""
-        rows, columns = frame.windows[track.object_id]
-        v, u = np.nonzero(frame.mask(track.object_id))
-        uv = np.array([[np.median(u) + columns.start, np.median(v) + rows.start]])
-        disparity = view.disparity_px[v + rows.start, u + columns.start]
-        disparity = disparity[disparity >= self.sensor.min_disparity_px]
-        center = np.full(3, np.nan)
-        if len(disparity):
-            z = self.camera.bf / np.array([np.median(disparity)], float)
-            center = transform_points(T_world_camera, backproject(self.camera, uv, z))[0]
-            if len(v) >= _MOSTLY_SEEN * track.area_px:  # else something is passing before it
-                track.take_center(center)
+        v, u = some_pixels(frame.labels, track.object_id, frame.windows[track.object_id])
+        center = middle_of_pixels(
+            self.camera, view.disparity_px, v, u, self.sensor.min_disparity_px
+        )
+        center = transform_points(T_world_camera, center[None])[0]
+        n_pixels = np.count_nonzero(frame.mask(track.object_id))
+        if np.isfinite(center).all() and n_pixels >= _MOSTLY_SEEN * track.area_px:
+            track.take_center(center)  # else something is passing before it
         if track.state is not ObjectState.STOPPED or not track.is_anchored:
             track.set_state(ObjectState.UNKNOWN, view.timestamp_s)
         table.add(track, frame.scores[track.object_id], center_m=center)

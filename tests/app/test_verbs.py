@@ -125,3 +125,31 @@ def test_bad_input_is_code_2_and_a_sentence(words: list[str], sentence: str) -> 
     assert done.returncode == 2, done.stdout + done.stderr
     assert sentence in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_optimize_starts_from_the_front_end_however_often(result: Path) -> None:
+    """The run's own batch and two more give the same; the front-end's answers stay beside."""
+    kept = (result / "front_end" / "camera_tum.txt").read_text()
+    by_run = (result / "camera_tum.txt").read_text()
+    assert by_run != kept
+    for _ in range(2):
+        done = app("optimize", result, "--quiet")
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert (result / "camera_tum.txt").read_text() == by_run
+        assert (result / "front_end" / "camera_tum.txt").read_text() == kept
+    metrics = json.loads((result / "metrics.json").read_text())
+    assert metrics["batch"]["accepted"] and metrics["batch"]["frames"] == N_FRAMES
+    assert metrics["front_end"]["camera"]["ate_rmse_m"] > 0.0
+    rows = (result / "camera_std.csv").read_text().splitlines()
+    assert rows[0].startswith("frame,timestamp_s,std_rx_deg") and len(rows) == 1 + N_FRAMES
+    partial = app("optimize", result, "--set", "batch.method=partial")
+    assert partial.returncode == 0, partial.stdout + partial.stderr
+    assert "Held-out sightings" in partial.stdout
+    assert app("optimize", result, "--quiet").returncode == 0
+
+
+def test_optimize_needs_what_the_run_recorded(tmp_path: Path) -> None:
+    (tmp_path / "camera_tum.txt").write_text("0 0 0 0 0 0 0 1\n")
+    done = app("optimize", tmp_path)
+    assert done.returncode != 0
+    assert "batch.record=true" in done.stderr

@@ -16,7 +16,7 @@ from pipelines import perception
 from pipelines.config import load_config
 from pipelines.datasets import open_sequence
 from pipelines.datasets.sequence import Sequence
-from pipelines.datasets.simulated.crossing import EVENTS, RETURNING_CAR, WAITING_CAR
+from pipelines.datasets.simulated.crossing import EVENTS, LEADING_CAR, RETURNING_CAR
 from pipelines.dyob_slam import DyObSlam
 from pipelines.evaluation.object_truth import RunFrames
 from pipelines.evaluation.objects import evaluate_objects
@@ -171,7 +171,9 @@ def test_stretched_time_stamps_halve_the_speeds(street, exact) -> None:
     n_compared = 0
     for one, other in zip(exact, process(street, (), stretched), strict=True):
         for i in np.flatnonzero((one.objects.state == MOVING) & (one.objects.speed_mps > 2.0)):
-            (j,) = np.flatnonzero(other.objects.object_id == one.objects.object_id[i])
+            mask = one.object_labels == one.objects.object_id[i]
+            its_id = np.bincount(other.object_labels[mask]).argmax()  # specks shift the numbers
+            (j,) = np.flatnonzero(other.objects.object_id == its_id)
             speed, halved = one.objects.speed_mps[i], other.objects.speed_mps[j]
             assert halved == pytest.approx(0.5 * speed, rel=0.005)
             n_compared += 1
@@ -303,6 +305,23 @@ def assert_survives(sequence: Sequence, results: list[FrameResult], object_id: i
     assert sum(i == 0 for i in found.values()) <= 2
 
 
+def coasting_errors_m(
+    sequence: Sequence, results: list[FrameResult], object_id: int
+) -> dict[int, float]:
+    """Frame -> distance of a true object's centre from where it coasts; no motion is told there."""
+    truth = sequence.ground_truth().objects
+    own_id = max(set(seen_as(sequence, results, object_id).values()))
+    errors_m = {}
+    for result in results:
+        objects, k = result.objects, result.frame_index
+        for i in np.flatnonzero((objects.object_id == own_id) & (objects.state == "coasting")):
+            (row,) = np.flatnonzero((truth.frame_index == k) & (truth.object_id == object_id))
+            away_m = objects.centers_m[i] - truth.Ts_world_object[row, :3, 3]
+            errors_m[k] = float(np.linalg.norm(away_m))
+            assert np.isnan(objects.Hs_world_curr_prev[i]).all()
+    return errors_m
+
+
 def test_identities_survive_being_hidden(render_cache) -> None:
     """A van passes before a waiting car, and before someone who walks the other way."""
     crossing = open_sequence("simulated:crossing", frames=40, scale=0.3, cache=render_cache)
@@ -318,17 +337,27 @@ def test_identities_survive_being_hidden(render_cache) -> None:
 
 
 @pytest.mark.slow
-def test_identities_survive_what_passes_before_them(render_cache) -> None:
-    """All of the crossing up to the car that backs up into view again.
-
-    At this size the waiting car is some pixels high, and the returning one is found again as
-    another: neither is held to its identity here.
-    """
-    crossing = open_sequence("simulated:crossing", frames=72, scale=0.4, cache=render_cache)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_identities_survive_leaving_the_picture(render_cache, seed) -> None:
+    """Everything of the crossing up to the car that leaves and backs up into view again."""
+    crossing = open_sequence(
+        "simulated:crossing", frames=72, scale=0.4, seed=seed, cache=render_cache
+    )
     results = process(crossing)
     for event in EVENTS:
-        if event.kind == "hidden" and event.object_id not in (WAITING_CAR, RETURNING_CAR):
-            assert_survives(crossing, results, event.object_id)
+        assert_survives(crossing, results, event.object_id)
+    assert max(seen_as(crossing, results, RETURNING_CAR)) > 66
+    # Out of sight it brakes, which it was seen to begin, and stands; nobody can know that it then
+    # backs up
+    away = coasting_errors_m(crossing, results, RETURNING_CAR)
+    assert {18, 19} | set(range(44, 67)) <= set(away)
+    assert all(0.05 < away_m < 2.0 for k, away_m in away.items() if k < 58)
+    assert max(away.values()) < 5.0
+    # It was seen from behind, so that its middle is known as that of its rear, half a car off
+    hidden = list(coasting_errors_m(crossing, results, LEADING_CAR).values())
+    assert len(hidden) == 9 or seed > 0
+    assert all(0.5 < away_m < 2.8 for away_m in hidden)
+    assert np.ptp(hidden or [0.0]) < 0.5
 
 
 # ------------------------------------------------------------------ landmarks

@@ -17,6 +17,7 @@ from pipelines.datasets import open_sequence
 from pipelines.errors import DatasetError
 from pipelines.io.ply import read_point_cloud
 from pipelines.io.result import Result, load_result
+from pipelines.io.trajectory import read_tum
 from pipelines.runner import run
 from pipelines.types import Frame, FrameResult, TrackingStatus
 
@@ -31,6 +32,7 @@ FILES = {
     "camera_gt_tum.txt",
     "objects_gt.csv",
 }
+BATCH = {"front_end", "observations", "camera_std.csv"}
 TRAJECTORIES = {"objects"}  # a folder, where there was an object
 TRUTH = {
     "vdo": ("pose_gt.txt", "object_pose.txt"),
@@ -91,7 +93,7 @@ def whole(street, tmp_path_factory) -> tuple[Result, Witness]:
 
 def test_the_folder_holds_the_files_of_the_design_and_no_others(whole) -> None:
     folder = whole[0].folder
-    assert names_in(folder) == FILES | TRAJECTORIES
+    assert names_in(folder) == FILES | TRAJECTORIES | BATCH
     ids = np.unique(whole[0].objects.object_id)
     assert len(ids) > 5
     written = {path.name for path in (folder / "objects").iterdir()}
@@ -300,13 +302,14 @@ def test_ctrl_c_leaves_the_frames_done_so_far(street, tmp_path, whole, at: int) 
     witness = Witness(at, KeyboardInterrupt())
     result = run(street, output=tmp_path / "partial", sinks=[witness])
     assert witness.told == ["start"] + ["frame"] * (at + 1) + ["finish"]
-    assert names_in(result.folder) == FILES | TRAJECTORIES
+    assert names_in(result.folder) == FILES | TRAJECTORIES | {"observations"}  # no batch
     counts = result.metrics["run"]
     assert counts["interrupted"] is True
     assert counts["frames"] == counts["tracked"] == at + 1
     partial = poses_of(result.folder / "camera_tum.txt")
     assert partial.num_poses == at + 1
-    np.testing.assert_array_equal(result.Ts_world_camera, whole[0].Ts_world_camera[: at + 1])
+    _, by_front_end = read_tum(whole[0].folder / "front_end" / "camera_tum.txt")
+    np.testing.assert_array_equal(result.Ts_world_camera, by_front_end[: at + 1])
     assert poses_of(result.folder / "camera_gt_tum.txt").num_poses == at + 1
     assert "interrupted" in (result.folder / "run.log").read_text()
 
@@ -362,7 +365,7 @@ def test_deleted_truth_changes_no_byte_of_the_estimate(dataset, request, tmp_pat
     expected = FILES - {"camera_gt_tum.txt", "objects_gt.csv"}
     if dataset != "kitti_odometry":  # a street without traffic
         expected |= TRAJECTORIES
-    assert names_in(without.folder) == expected
+    assert names_in(without.folder) == expected | BATCH
     assert without.metrics["run"]["tracked"] > 5
     assert estimates(with_truth.folder) == estimates(without.folder)
     if dataset == "vdo":  # its masks make objects at once: bytes of something were compared

@@ -78,7 +78,9 @@ class Body:
         error[wrong] += (rng.choice([-1, 1], (n, 2)) * rng.uniform(8, 60, (n, 2)))[wrong]
         error_d = rng.normal(size=n) * noise * SIGMA_DISPARITY_PX
         now += np.stack([error[:, 0], error[:, 1], error[:, 0] - error_d], -1)
-        points = ObjectPoints(np.full(n, object_id), position, covariance, before[:, :2])
+        points = ObjectPoints(
+            np.full(n, object_id), position, covariance, before[:, :2], np.arange(n)
+        )
         sigma_uv = np.full(n, max(noise * SIGMA_UV_PX, 1e-4))
         return points, StereoObservations(position, covariance, now, sigma_uv, sigma_d)
 

@@ -33,7 +33,9 @@ def points_in(object_id, part, n=30, shift=(0.0, 0.0), seed=0):
     rows, columns = part
     rng = np.random.default_rng(seed)
     uv = rng.uniform([columns.start, rows.start], [columns.stop - 1, rows.stop - 1], (n, 2))
-    points = ObjectPoints(np.full(n, object_id), np.ones((n, 3)), np.zeros((n, 3, 3)), uv)
+    points = ObjectPoints(
+        np.full(n, object_id), np.ones((n, 3)), np.zeros((n, 3, 3)), uv, np.arange(n)
+    )
     now = uv + shift
     return points, Followed(now, np.ones(n, bool), np.full(n, 0.3), now, now)
 

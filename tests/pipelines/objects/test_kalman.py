@@ -63,6 +63,42 @@ def test_coasting_goes_on_and_its_doubt_grows():
     assert (np.diff(std) > 0).all() and (np.diff(spread) > 0).all()
 
 
+def test_what_brakes_stands_in_the_end_and_never_turns_round():
+    """Seen from 8 m/s down to 3 m/s at 2.5 m/s^2; a filter that goes on at 3 m/s is metres off."""
+    speeds = 8.0 - 0.25 * np.arange(21)
+    centers = np.stack([np.cumsum(speeds * DT_S), np.zeros(21), np.zeros(21)], -1)
+    kf = feed(np.random.default_rng(3), centers, np.zeros(3))
+    before, start, ways = kf.speed_std_mps, kf.center_m, []
+    for k in range(20):
+        kf.coast(DT_S, DT_S * (k + 1))
+        ways.append(kf.center_m[0] - start[0])
+    assert 1.3 < ways[-1] < 4.5  # braking on takes 1.8 m
+    assert (np.diff(ways) > -1e-9).all()
+    assert before + 4.0 < kf.speed_std_mps < 8.0  # 3 m/s^2 for two seconds
+
+
+def test_what_has_no_sure_velocity_stays():
+    kf = ObjectFilter(np.array([1.0, 0.0, 30.0]), np.eye(3), 3.0)
+    kf.predict(DT_S)
+    kf.update_center(np.array([3.0, 0.0, 30.0]), np.eye(3))
+    where = kf.center_m
+    assert np.linalg.norm(kf.velocity_mps) > 1.0
+    spread = [kf.distances2(where[None], np.zeros((3, 3)))[1]]
+    for _ in range(10):
+        kf.stay(DT_S)
+        spread.append(kf.distances2(where[None], np.zeros((3, 3)))[1])
+    np.testing.assert_array_equal(kf.center_m, where)
+    assert (np.diff(spread) > 0).all() and 5.0 <= kf.speed_std_mps < 6.0
+
+
+def test_a_wild_centre_does_not_carry_the_filter_away():
+    kf = feed(np.random.default_rng(1), path(30, 12.0, 0.0), np.zeros(3))
+    kf.predict(DT_S)
+    before = kf.center_m
+    kf.update_center(before + np.array([0.0, 0.0, 40.0]), np.eye(3))
+    assert 0.0 < kf.center_m[2] - before[2] < 1.0
+
+
 @pytest.mark.parametrize("turn_radps", [0.3, -0.6])
 def test_the_turn_rate_helps_a_turning_object(turn_radps):
     """Error of the predicted centre after coasting for half a second, with and without it."""

@@ -19,7 +19,7 @@ def points_of(ids):
     ids = np.array(ids, np.int64)
     n = len(ids)
     place = np.arange(3.0 * n).reshape(n, 3)
-    return ObjectPoints(ids, place, np.repeat(np.eye(3)[None], n, 0), place[:, :2])
+    return ObjectPoints(ids, place, np.repeat(np.eye(3)[None], n, 0), place[:, :2], np.arange(n))
 
 
 def test_points_of_several_parts_are_sorted_by_object_and_keep_together():

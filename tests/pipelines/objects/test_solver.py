@@ -130,7 +130,8 @@ def test_a_long_object_is_one_surface_and_each_is_judged_alone(kitti):
     z = np.r_[np.linspace(10, 14, n), np.full(n, 30.0), [10.0]]
     ids = np.r_[np.full(n, 1), np.full(n + 1, 2)]
     position = np.stack([rng.normal(size=len(z)), rng.normal(size=len(z)), z], -1)
-    points = ObjectPoints(ids, position, np.zeros((len(z), 3, 3)), np.zeros((len(z), 2)))
+    none = np.zeros((len(z), 3, 3)), np.zeros((len(z), 2))
+    points = ObjectPoints(ids, position, *none, np.arange(len(z)))
     near = on_one_surface(kitti, points, 0.3)
     assert near[:-1].all() and not near[-1]
     assert on_one_surface(kitti, ObjectPoints.empty(), 0.3).shape == (0,)

@@ -155,7 +155,7 @@ def test_the_box_ignores_a_stray_point_and_grows_gradually():
     for _ in range(20):
         track.take_points(transform_points(T, corners * [1, 1, 2.0]))
     assert track.extent_m[2] == pytest.approx(7.4, rel=0.07)  # its 4th to 96th percentile
-    assert track.center_sigma_m == pytest.approx(0.35 * track.extent_m.max())
+    assert track.center_sigma_m == 1.75  # four of it are half of the longest things
 
 
 def test_velocity_of_a_point_off_the_centre_of_a_turning_object():
@@ -209,3 +209,44 @@ def test_what_stands_for_long_enough_is_a_landmark():
     track.set_state(ObjectState.MOVING, 11.5)
     track.set_state(ObjectState.STOPPED, 12.0)
     assert not track.is_landmark(12.5) and track.is_landmark(13.0)
+
+
+def test_what_never_moved_stays_where_it_was_and_what_moved_coasts():
+    still, _ = drive(10, way_m=(0.0, 0.0, 0.0))
+    moving, _ = drive(10)
+    assert moving.surely_moves and not still.surely_moves
+    for track, way_m in ((still, 0.0), (moving, 5.0)):
+        start = track.filter.center_m
+        for _ in range(5):
+            track.coast(DT_S)
+            track.unconfirmed_s += DT_S
+            track.predict(DT_S)
+        assert np.linalg.norm(track.filter.center_m - start) == pytest.approx(way_m, abs=0.1)
+
+
+def test_the_middle_of_the_box_outlasts_it():
+    track, truth = drive(10, way_m=(0.0, 0.0, 0.0))
+    points = np.random.default_rng(0).uniform(-1, 1, (200, 3)) + np.array([0.0, 0.0, 2.0])
+    track.take_points(points + truth[-1][:3, 3])
+    for _ in range(8):
+        track.predict(DT_S)
+        track.coast(DT_S)
+    assert track.box_center_m is None
+    np.testing.assert_allclose(track.middle_offset_m, [0.0, 0.0, 2.0], atol=0.15)
+
+
+def test_few_points_have_strays_too():
+    track, truth = drive(10, way_m=(0.0, 0.0, 0.0))
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3)) + truth[-1][:3, 3]
+    track.take_points(np.r_[points, truth[-1][:3, 3] + [[0.0, 0.0, 13.0]]])
+    assert 1.0 < track.extent_m[2] < 2.1
+
+
+def test_the_speed_of_what_turns_is_the_less_certain():
+    straight, _ = drive(40)
+    turning, _ = drive(40, turn_rad=0.05)
+    for track in (straight, turning):
+        track.take_points(track.filter.center_m + np.random.default_rng(0).uniform(-2, 2, (99, 3)))
+    assert straight.middle_doubt_mps(0.0) == 0.0
+    assert turning.middle_doubt_mps(0.5) == pytest.approx(0.5 * 0.12 * turning.extent_m.max())
+    assert turning.velocity_std_mps > straight.velocity_std_mps + 0.05

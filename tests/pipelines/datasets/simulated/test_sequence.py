@@ -142,7 +142,7 @@ def test_scenes_have_the_sizes_that_are_promised():
 
 def test_unknown_scene_names_the_valid_ones(tmp_path):
     with pytest.raises(
-        DatasetError, match=r"'beach'.*street, room, crossing, static, demo, kitti_0000"
+        DatasetError, match=r"'beach'.*street, room, crossing, loop, long, static, demo, kitti_0000"
     ):
         SimulatedSequence("simulated:beach", cache=tmp_path)
 
