@@ -102,6 +102,7 @@ def run(
                 _write(writer, sequence, slam, progress)
             raise
         finally:
+            slam.close()
             for sink in sinks:
                 sink.finish()
         if not progress.results and not progress.interrupted:
@@ -205,13 +206,15 @@ def _prepare_ahead(
 
 def _write(writer: ResultWriter, sequence: Sequence, slam: DyObSlam, progress: _Progress) -> None:
     """All files: first what was estimated; the truth, which may be damaged, costs only errors."""
-    static_map = slam.static_map()
-    writer.write_run(progress.results, static_map)
+    static_map, results = slam.static_map(), slam.revise(progress.results)
+    writer.write_run(results, static_map)
     if progress.recorder is not None:
-        progress.recorder.finish(static_map.track_ids)
+        progress.recorder.finish(
+            static_map.track_ids, {r.frame_index: r.T_world_camera for r in results}
+        )
     metrics = {
         "run": run_metrics(
-            progress.results,
+            results,
             static_map,
             sequence=sequence.name,
             dataset=sequence.dataset,
@@ -223,7 +226,7 @@ def _write(writer: ResultWriter, sequence: Sequence, slam: DyObSlam, progress: _
     try:
         truth = sequence.ground_truth()
         if truth is not None:
-            writer.write_ground_truth(progress.results, truth)
+            writer.write_ground_truth(results, truth)
     except DatasetError as error:
         _log.warning("no errors can be computed, the ground truth cannot be read: %s", error)
     evaluate_result(writer.folder)

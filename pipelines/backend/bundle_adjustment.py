@@ -1,4 +1,4 @@
-"""Bundle adjustment of keyframes and static points by gtsam; local and full, steps 11 of the design.
+"""Bundle adjustment of keyframes and static points by gtsam; step 11 of the design.
 
 Owns the problem, its factors and its solution, as arrays that any process can take. Which keyframes
 and points go in is decided by `local_window` and `loop_closing`.
@@ -143,13 +143,16 @@ def _noise(sigma_uv_px: float, sigma_disparity_px: float | None) -> Any:
     """Huber on pixels (u_L, u_R, v), or (u, v) without a disparity; u_R = u_L - d shares u_L's."""
     import gtsam
 
+    gaussian: gtsam.noiseModel.Gaussian
     if sigma_disparity_px is None:
         gaussian = gtsam.noiseModel.Isotropic.Sigma(2, sigma_uv_px)
     else:
         uv, d = sigma_uv_px**2, sigma_disparity_px**2
         covariance = np.array([[uv, uv, 0.0], [uv, uv + d, 0.0], [0.0, 0.0, uv]])
         gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(_HUBER), gaussian)
+    return gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Huber.Create(_HUBER), gaussian
+    )
 
 
 def _values(Ts: Array, points: Array, which: NDArray[np.int64]) -> gtsam.Values:

@@ -42,6 +42,7 @@ def local_window(
         return None
     neighbours = sparse_map.covisible_keyframes(last)[: config.local_keyframes - 1]
     free = np.sort(np.append(neighbours, last))
+    free = free[free > 0]  # the first keyframe is where the world is
     seen = np.zeros(len(sparse_map.alive), bool)
     for k in free:
         seen[sparse_map.keyframes[k].tracks.point_ids] = True

@@ -16,10 +16,12 @@ import pickle
 import subprocess
 import sys
 import threading
+import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import IO, Any, Protocol
 
 _log = logging.getLogger("dyob.backend")
 _ROOT = Path(__file__).resolve().parent.parent.parent
@@ -28,7 +30,7 @@ _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _CLOSE_S = 2.0  # s, that a process has for ending by itself
 
 
-class WorkerDied(RuntimeError):
+class WorkerDied(RuntimeError):  # noqa: N818
     """The process ended before it answered; the question may be asked again."""
 
 
@@ -58,78 +60,55 @@ class InlineWorker:
         """Nothing to stop."""
 
 
-class ProcessWorker:
-    """Does the work in a child process, which is started when there is some."""
+class _Child:
+    """One child process, and the futures of the questions that it has not answered."""
 
     def __init__(self) -> None:
-        self._process: subprocess.Popen[bytes] | None = None
-        self._pending: list[Future[Any]] = []
-        self._lock = threading.Lock()
-
-    @property
-    def pid(self) -> int | None:
-        """Of the child process, None before it is started."""
-        return None if self._process is None else self._process.pid
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Answers come in the order of questions; WorkerDied is one if the process ends."""
-        future: Future[Any] = Future()
-        message = pickle.dumps((function, arguments), protocol=pickle.HIGHEST_PROTOCOL)
-        for attempt in range(2):
-            process = self._running()
-            with self._lock:
-                self._pending.append(future)
-            try:
-                assert process.stdin is not None
-                _send(process.stdin, message)
-                return future
-            except OSError:  # it died between two questions
-                with self._lock:
-                    if future in self._pending:
-                        self._pending.remove(future)
-                _log.warning("the back-end's process ended by itself; attempt %d", attempt + 1)
-                self._process = None
-        future.set_exception(WorkerDied("the back-end's process could not be started"))
-        return future
-
-    def close(self) -> None:
-        """End the child process."""
-        process, self._process = self._process, None
-        if process is None:
-            return
-        assert process.stdin is not None
-        try:
-            process.stdin.close()
-            process.wait(_CLOSE_S)
-        except (OSError, subprocess.TimeoutExpired):
-            process.kill()
-            process.wait()
-
-    def _running(self) -> subprocess.Popen[bytes]:
-        if self._process is not None and self._process.poll() is None:
-            return self._process
         environment = {**os.environ, **dict.fromkeys(_ONE_THREAD, "1")}
         environment["PYTHONPATH"] = os.pathsep.join(
             [str(_ROOT), *filter(None, [environment.get("PYTHONPATH")])]
         )
-        process = subprocess.Popen(
-            [sys.executable, "-m", __name__],
+        self.process = subprocess.Popen(
+            [sys.executable, "-P", "-m", __name__],  # nothing from the working folder
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=environment,
             start_new_session=True,  # Ctrl-C is for the run, which then ends this one
         )
-        self._process = process
-        threading.Thread(target=self._read, args=(process,), daemon=True).start()
-        return process
+        self._pending: list[Future[Any]] = []
+        self._lock = threading.Lock()
+        threading.Thread(target=self._read, name="back-end", daemon=True).start()
 
-    def _read(self, process: subprocess.Popen[bytes]) -> None:
+    def ask(self, message: bytes) -> Future[Any]:
+        """Hand over a question. Raises OSError where the process is no more."""
+        assert self.process.stdin is not None
+        future: Future[Any] = Future()
+        with self._lock:
+            self._pending.append(future)
+        _send(self.process.stdin, message)
+        return future
+
+    def end(self) -> None:
+        """Let it end by itself, else make it."""
+        assert self.process.stdin is not None
+        with suppress(OSError):  # what could not be flushed is lost
+            self.process.stdin.close()
+        try:
+            self.process.wait(_CLOSE_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+    def _read(self) -> None:
         """Hand answers to their futures until the process ends."""
-        assert process.stdout is not None
-        while (message := _receive(process.stdout)) is not None:
+        assert self.process.stdout is not None
+        while (message := _receive(self.process.stdout)) is not None:
+            try:
+                answer, error = pickle.loads(message)
+            except Exception as reason:  # an error that pickles, but cannot be made again
+                answer, error = None, RuntimeError(f"an answer cannot be read: {reason!r}")
             with self._lock:
                 future = self._pending.pop(0)
-            answer, error = pickle.loads(message)
             if error is None:
                 future.set_result(answer)
             else:
@@ -138,15 +117,57 @@ class ProcessWorker:
             lost, self._pending = self._pending, []
         for future in lost:
             future.set_exception(WorkerDied("the back-end's process ended before it answered"))
+        self.process.stdout.close()
 
 
-def _send(pipe: BinaryIO, message: bytes) -> None:
+class ProcessWorker:
+    """Does the work in a child process, which is started when there is some.
+
+    It ends with `close`, or when nobody knows of this worker any longer.
+    """
+
+    def __init__(self) -> None:
+        self._child: _Child | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """Of the child process, None before it is started."""
+        return None if self._child is None else self._child.process.pid
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Answers come in the order of questions; WorkerDied is one if the process ends."""
+        message = pickle.dumps((function, arguments), protocol=pickle.HIGHEST_PROTOCOL)
+        for _ in range(2):
+            try:
+                return self._running().ask(message)
+            except OSError as error:  # it died between two questions
+                _log.warning("the back-end's process cannot be asked: %s", error)
+                self.close()
+        future: Future[Any] = Future()
+        future.set_exception(WorkerDied("the back-end's process could not be started"))
+        return future
+
+    def close(self) -> None:
+        """End the child process."""
+        child, self._child = self._child, None
+        if child is not None:
+            child.end()
+
+    def _running(self) -> _Child:
+        child = self._child
+        if child is None or child.process.poll() is not None:
+            child = self._child = _Child()
+            weakref.finalize(self, child.end)
+        return child
+
+
+def _send(pipe: IO[bytes], message: bytes) -> None:
     pipe.write(len(message).to_bytes(_LENGTH_BYTES, "little"))
     pipe.write(message)
     pipe.flush()
 
 
-def _receive(pipe: BinaryIO) -> bytes | None:
+def _receive(pipe: IO[bytes]) -> bytes | None:
     """The next message, None at the end of the pipe."""
     header = pipe.read(_LENGTH_BYTES)
     if len(header) < _LENGTH_BYTES:
@@ -163,6 +184,7 @@ def _serve() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what libraries print is no answer
     while (message := _receive(questions)) is not None:
         function, arguments = pickle.loads(message)
+        answer: tuple[Any, Exception | None]
         try:
             answer = (function(*arguments), None)
         except Exception as error:

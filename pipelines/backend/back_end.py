@@ -1,0 +1,135 @@
+"""Local bundle adjustment beside tracking: when it is asked, and when its answer moves the map.
+
+Owns the one question that is under way and the judgement of its answer. What is adjusted is chosen
+by `local_window`, solved by `bundle_adjustment` and moved by `mapping.correction`.
+
+An answer is applied a fixed number of frames after its question, however soon it is there: so the
+same run moves the same map at the same frame, in a process or in this one.
+"""
+
+from __future__ import annotations
+
+import logging
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.backend.bundle_adjustment import BundleSolution, adjust_bundle
+from pipelines.backend.local_window import BundleWindow, local_window, to_correction
+from pipelines.backend.worker import InlineWorker, ProcessWorker, Worker
+from pipelines.config import BackendConfig
+from pipelines.frontend.sensor import Sensor
+from pipelines.geometry import invert_T, rotation_angle_deg
+from pipelines.mapping.correction import MapCorrection
+from pipelines.mapping.sparse_map import SparseMap
+
+_MIN_AGREEING = 0.5  # share of observations; where fewer agree, something else is wrong
+_MAX_MOVE_M, _MAX_MOVE_SHARE = 0.05, 0.02  # of a keyframe, and of its way from the held ones
+_MAX_TURN_DEG = 0.5  # of a keyframe
+_log = logging.getLogger("dyob.backend")
+
+
+@dataclass(frozen=True, slots=True)
+class _Question:
+    """A local bundle adjustment under way. due: the count of frames at which it is applied."""
+
+    window: BundleWindow
+    answer: Future[BundleSolution]
+    due: int
+
+
+class BackEnd:
+    """Improves the latest keyframes and their points while tracking goes on.
+
+    worker: where the work is done; by default as the settings say.
+    """
+
+    def __init__(self, sensor: Sensor, config: BackendConfig, worker: Worker | None = None) -> None:
+        self.sensor, self.config = sensor, config
+        self.worker = worker or (ProcessWorker() if config.process else InlineWorker())
+        self._question: _Question | None = None
+        self._n_frames = 0
+        self._warned = False
+        self.n_applied = self.n_refused = 0
+
+    def take(self) -> MapCorrection | None:
+        """The correction that is due, if one is; to be called once a frame, before tracking.
+
+        Waits for an answer that is late, unless `wait` is false. Answers that would make the map
+        worse, and those that never came, are dropped.
+        """
+        self._n_frames += 1
+        question = self._question
+        if question is None:
+            return None
+        late = self._n_frames >= question.due
+        if not (late if self.config.wait else question.answer.done()):
+            return None
+        self._question = None
+        try:
+            solution = question.answer.result()
+        except Exception as error:  # of any kind: the run does not depend on it
+            self._warn(error)
+            return None
+        reason = _reason_to_refuse(question.window, solution)
+        if reason is not None:
+            self.n_refused += 1
+            _log.info("local bundle adjustment refused: %s", reason)
+            return None
+        self.n_applied += 1
+        return to_correction(question.window, solution)
+
+    def after_keyframe(self, sparse_map: SparseMap) -> None:
+        """Ask for the adjustment of the map's latest keyframe and its neighbours.
+
+        Does nothing while an answer is awaited. The map is copied, not changed.
+        """
+        config = self.config
+        if not config.local_adjustment or self._question is not None:
+            return
+        window = local_window(sparse_map, self.sensor, config)
+        if window is None:
+            return
+        n = len(window.problem.keyframe)
+        due = self._n_frames + config.latency_frames + n // config.observations_per_frame
+        answer = self.worker.submit(adjust_bundle, window.problem, config.rounds, config.iterations)
+        self._question = _Question(window, answer, due)
+
+    def close(self) -> None:
+        """End the process, if there is one; an answer that is under way never comes."""
+        self._question = None
+        self.worker.close()
+
+    def _warn(self, error: Exception) -> None:
+        """Once as a warning: what fails for good would fail at every keyframe."""
+        level = logging.INFO if self._warned else logging.WARNING
+        self._warned = True
+        _log.log(level, "local bundle adjustment dropped, the run goes on: %s", error)
+
+
+def _reason_to_refuse(window: BundleWindow, solution: BundleSolution) -> str | None:
+    """Why a solution is not believed, None where it is.
+
+    It must lower the error of the observations that agree in the end, most must agree, and no
+    keyframe may jump: beyond 5 cm and 2 % of its way from the nearest held one, or by half a
+    degree, which is far more than tracking errs by among neighbours.
+    """
+    problem = window.problem
+    if not np.isfinite(solution.Ts_world_camera).all():
+        return "its poses are not finite"
+    if not solution.error_after < solution.error_before:
+        return f"error {solution.error_before:.1f} before, {solution.error_after:.1f} after"
+    share = float(solution.inliers.mean())
+    if share < _MIN_AGREEING:
+        return f"only {share:.0%} of the observations agree with it"
+    Ts_old, Ts_new = problem.Ts_world_camera, solution.Ts_world_camera
+    moved_m = np.linalg.norm(Ts_new[:, :3, 3] - Ts_old[:, :3, 3], axis=1)
+    centers_m = Ts_old[:, :3, 3]
+    way_m = np.linalg.norm(centers_m[:, None] - centers_m[problem.held], axis=2).min(axis=1)
+    if (moved_m > _MAX_MOVE_M + _MAX_MOVE_SHARE * way_m).any():
+        return f"a keyframe would move by {moved_m.max():.3f} m"
+    turned_deg = rotation_angle_deg(invert_T(Ts_old) @ Ts_new)
+    if (turned_deg > _MAX_TURN_DEG).any():
+        return f"a keyframe would turn by {turned_deg.max():.2f} deg"
+    return None
