@@ -288,7 +288,7 @@ class BatchConfig:
 
     at_end: bool = True  # the global batch runs when a run is over; `optimize` does it again
     record: bool = True  # keep what every frame saw in the result folder, for `optimize`
-    objects: bool = True  # false: cameras and static points alone
+    with_objects: bool = True  # false: cameras and static points alone
     rounds: int = 2  # solutions, each without the outliers of the one before
     max_steps: int = 5  # of Levenberg-Marquardt in a round
     acceleration_mps2: float = 1.0  # m/s^2, standard deviation of the change of a speed

@@ -23,7 +23,7 @@ def calls(monkeypatch, tmp_path) -> dict[str, Any]:
         seen["opened"] = (path, dataset, name, options)
         return "the sequence"
 
-    def run(sequence, config=None, output=None, *, sinks=(), **span):
+    def run(sequence, config=None, output=None, *, sinks=(), batch_progress=None, **span):
         seen.update(sequence=sequence, config=config, output=output, sinks=sinks, span=span)
         return SimpleNamespace(folder=tmp_path, metrics={"run": seen["counts"]}, timings={})
 
