@@ -17,7 +17,14 @@ from pipelines.frontend.hypotheses import estimate_pnp, reprojection_inliers
 from pipelines.frontend.matching import match_all, match_in_radius
 from pipelines.frontend.motion_only_ba import estimate_camera_pose
 from pipelines.frontend.sensor import Sensor
-from pipelines.geometry import MIN_DEPTH_M, inside_image, invert_T, project_stereo, transform_points
+from pipelines.geometry import (
+    MIN_DEPTH_M,
+    inside_image,
+    invert_T,
+    project_stereo,
+    rotation_angle_deg,
+    transform_points,
+)
 from pipelines.mapping.sparse_map import SparseMap
 from pipelines.observations import Tracks
 from pipelines.types import Array, Features
@@ -33,22 +40,35 @@ _PNP_PX = 4.0  # reprojection error of an inlier: corners lie on coarse levels t
 _MIN_MATCHES, _MIN_PNP_INLIERS, _MIN_PNP_SHARE = 25, 20, 0.3
 _GUIDED_PX = 8.0  # radius of the second search, once the pose is known
 _MIN_INLIERS, _MIN_SHARE = 50, 0.5  # of the guided matches, for proof
+# Houses resemble each other: two keyframes must tell the same of where the map is off
+_WITHIN = 5  # keyframes
+_SAME_SHARE, _SAME_DEG = 0.03, 1.0  # of the depth of what was seen, and of direction
 _SEED = 0
 
 
 @dataclass(frozen=True, slots=True)
 class LoopClosure:
-    """A keyframe seen again.
+    """A place seen again.
 
-    keyframe: row of the new one. place: row of the old one. T_world_camera: (4, 4) where the old
-    part of the map says that the new one is. point_ids: (N,) old points that it sees, at
-    features: (N,) rows of its features.
+    keyframe: row of the new keyframe. place: row of the old one. T_world_camera: (4, 4) where the
+    old part of the map says that the new one is. tracks: old points that it sees. off: (4, 4) how
+    the new keyframe would move, p_new = off @ p_old. depth_m: median of what it sees.
     """
 
     keyframe: int
     place: int
     T_world_camera: Array
     tracks: Tracks
+    off: Array
+    depth_m: float
+
+    def agrees_with(self, other: LoopClosure) -> bool:
+        """Whether two closures move what this one sees alike."""
+        between = invert_T(self.T_world_camera) @ self.off @ invert_T(other.off)
+        between = between @ self.T_world_camera
+        far_m = float(np.linalg.norm(between[:3, 3]))
+        turned_deg = float(rotation_angle_deg(between))
+        return far_m <= _SAME_SHARE * self.depth_m and turned_deg <= _SAME_DEG
 
 
 class LoopDetector:
@@ -57,9 +77,25 @@ class LoopDetector:
     def __init__(self, sensor: Sensor, vocabulary: Vocabulary) -> None:
         self.sensor, self._vocabulary = sensor, vocabulary
         self._places = PlaceDatabase(vocabulary.n_words)
+        self._unconfirmed: list[LoopClosure] = []
 
     def take(self, sparse_map: SparseMap, features: Features) -> LoopClosure | None:
-        """Ask about the latest keyframe, whose ORB features these are, and remember it."""
+        """Ask about the latest keyframe, whose ORB features these are, and remember it.
+
+        A loop is told when a second keyframe, a few later at most, bears out the first.
+        """
+        closure = self._find(sparse_map, features)
+        if closure is None:
+            return None
+        recent = [c for c in self._unconfirmed if closure.keyframe - c.keyframe <= _WITHIN]
+        if any(closure.agrees_with(other) for other in recent):
+            self._unconfirmed = []
+            return closure
+        self._unconfirmed = [*recent, closure]
+        return None
+
+    def _find(self, sparse_map: SparseMap, features: Features) -> LoopClosure | None:
+        """The loop that the latest keyframe alone would prove; the keyframe is remembered."""
         index = len(sparse_map.keyframes) - 1
         bow = self._vocabulary.describe(self._vocabulary.words(features.descriptors))
         near = self._near(sparse_map, index)
@@ -157,4 +193,13 @@ class LoopDetector:
         enough = max(_MIN_INLIERS, _MIN_SHARE * len(points))
         if estimate.n_inliers < enough:
             return None
-        return LoopClosure(index, place, estimate.T_world_camera, tracks[estimate.inliers])
+        T = estimate.T_world_camera
+        seen = transform_points(invert_T(T), sparse_map.position_m[tracks.point_ids])
+        return LoopClosure(
+            index,
+            place,
+            T,
+            tracks[estimate.inliers],
+            T @ invert_T(sparse_map.keyframes[index].T_world_camera),
+            float(np.median(seen[estimate.inliers, 2])),
+        )
