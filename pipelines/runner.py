@@ -209,9 +209,12 @@ def _write(writer: ResultWriter, sequence: Sequence, slam: DyObSlam, progress: _
     static_map, results = slam.static_map(), slam.revise(progress.results)
     writer.write_run(results, static_map)
     if progress.recorder is not None:
-        progress.recorder.finish(
-            static_map.track_ids, {r.frame_index: r.T_world_camera for r in results}
-        )
+        corrected = {
+            now.frame_index: now.T_world_camera
+            for now, then in zip(results, progress.results, strict=True)
+            if now is not then
+        }
+        progress.recorder.finish(static_map.track_ids, corrected)
     metrics = {
         "run": run_metrics(
             results,

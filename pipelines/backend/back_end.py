@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.backend.bundle_adjustment import BundleSolution, adjust_bundle
+from pipelines.backend.bundle_adjustment import BundleSolution, adjust_bundle, load_solver
 from pipelines.backend.local_window import BundleWindow, local_window, to_correction
 from pipelines.backend.worker import InlineWorker, ProcessWorker, Worker
 from pipelines.config import BackendConfig
@@ -60,6 +60,8 @@ class BackEnd:
         worse, and those that never came, are dropped.
         """
         self._n_frames += 1
+        if self._n_frames == 1 and self.config.local_adjustment:
+            self.worker.submit(load_solver)  # starts the process, so that no answer waits for it
         question = self._question
         if question is None:
             return None
@@ -72,7 +74,7 @@ class BackEnd:
         except Exception as error:  # of any kind: the run does not depend on it
             self._warn(error)
             return None
-        reason = _reason_to_refuse(question.window, solution)
+        reason = reason_to_refuse(question.window, solution)
         if reason is not None:
             self.n_refused += 1
             _log.info("local bundle adjustment refused: %s", reason)
@@ -108,7 +110,7 @@ class BackEnd:
         _log.log(level, "local bundle adjustment dropped, the run goes on: %s", error)
 
 
-def _reason_to_refuse(window: BundleWindow, solution: BundleSolution) -> str | None:
+def reason_to_refuse(window: BundleWindow, solution: BundleSolution) -> str | None:
     """Why a solution is not believed, None where it is.
 
     It must lower the error of the observations that agree in the end, most must agree, and no

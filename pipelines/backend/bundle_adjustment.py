@@ -70,6 +70,11 @@ class BundleSolution:
     error_after: float
 
 
+def load_solver() -> None:
+    """Import gtsam, which takes the best part of a second where it was not yet."""
+    import gtsam  # noqa: F401
+
+
 def adjust_bundle(problem: BundleProblem, rounds: int = 2, iterations: int = 10) -> BundleSolution:
     """Minimise the stereo reprojection errors of all observations over poses and points.
 

@@ -75,6 +75,7 @@ class _Child:
             env=environment,
             start_new_session=True,  # Ctrl-C is for the run, which then ends this one
         )
+        self.answers = True  # until its pipe ends, which may be before it counts as ended
         self._pending: list[Future[Any]] = []
         self._lock = threading.Lock()
         threading.Thread(target=self._read, name="back-end", daemon=True).start()
@@ -84,6 +85,8 @@ class _Child:
         assert self.process.stdin is not None
         future: Future[Any] = Future()
         with self._lock:
+            if not self.answers:
+                raise BrokenPipeError("it has ended")
             self._pending.append(future)
         _send(self.process.stdin, message)
         return future
@@ -114,6 +117,7 @@ class _Child:
             else:
                 future.set_exception(error)
         with self._lock:
+            self.answers = False
             lost, self._pending = self._pending, []
         for future in lost:
             future.set_exception(WorkerDied("the back-end's process ended before it answered"))
@@ -155,7 +159,7 @@ class ProcessWorker:
 
     def _running(self) -> _Child:
         child = self._child
-        if child is None or child.process.poll() is not None:
+        if child is None or not child.answers or child.process.poll() is not None:
             child = self._child = _Child()
             weakref.finalize(self, child.end)
         return child
