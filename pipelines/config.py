@@ -262,9 +262,10 @@ class PlacesConfig:
 
 @dataclass(frozen=True, slots=True)
 class BackendConfig:
-    """Step 11: local bundle adjustment of the latest keyframes, beside tracking."""
+    """Step 11: local bundle adjustment of the latest keyframes, and loops, beside tracking."""
 
-    local_adjustment: bool = True
+    local_adjustment: bool = True  # of the latest keyframes and their points
+    loop_closing: bool = True  # places seen before correct the drift since then
     process: bool = True  # in a process of its own; false: in this one, with the same answers
     # an answer is due a fixed number of frames after its question, and waited for, so that runs
     # repeat to the bit; false: it is taken when it comes, for live use

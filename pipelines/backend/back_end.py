@@ -1,7 +1,8 @@
-"""Local bundle adjustment beside tracking: when it is asked, and when its answer moves the map.
+"""Bundle adjustment and loops beside tracking: when they are asked, when an answer moves the map.
 
 Owns the one question that is under way and the judgement of its answer. What is adjusted is chosen
-by `local_window`, solved by `bundle_adjustment` and moved by `mapping.correction`.
+by `local_window` and solved by `bundle_adjustment`; loops are found by `loop_detection` and closed
+by `pose_graph`; `mapping.correction` moves the map. A loop goes before an adjustment.
 
 An answer is applied a fixed number of frames after its question, however soon it is there: so the
 same run moves the same map at the same frame, in a process or in this one.
@@ -10,33 +11,44 @@ same run moves the same map at the same frame, in a process or in this one.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from pipelines.backend.bundle_adjustment import BundleSolution, adjust_bundle, load_solver
 from pipelines.backend.local_window import BundleWindow, local_window, to_correction
+from pipelines.backend.loop_detection import LoopDetector
+from pipelines.backend.pose_graph import build_pose_graph, loop_correction, solve_pose_graph
+from pipelines.backend.vocabulary_files import load_vocabulary
 from pipelines.backend.worker import InlineWorker, ProcessWorker, Worker
-from pipelines.config import BackendConfig
+from pipelines.config import BackendConfig, PlacesConfig
 from pipelines.frontend.sensor import Sensor
 from pipelines.geometry import invert_T, rotation_angle_deg
 from pipelines.mapping.correction import MapCorrection
 from pipelines.mapping.sparse_map import SparseMap
+from pipelines.types import Features
 
 _MIN_AGREEING = 0.5  # share of observations; where fewer agree, something else is wrong
 _MAX_MOVE_M, _MAX_MOVE_SHARE = 0.05, 0.02  # of a keyframe, and of its way from the held ones
 _MAX_TURN_DEG = 0.5  # of a keyframe
+_OBSERVATIONS_PER_EDGE = 3  # what an edge of the pose graph costs, in observations
 _log = logging.getLogger("dyob.backend")
 
 
 @dataclass(frozen=True, slots=True)
 class _Question:
-    """A local bundle adjustment under way. due: the count of frames at which it is applied."""
+    """Work under way. what: for people. due: the count of frames at which its answer is applied.
 
-    window: BundleWindow
-    answer: Future[BundleSolution]
+    judge: makes a correction of the answer, or says why it is refused.
+    """
+
+    what: str
+    answer: Future[Any]
     due: int
+    judge: Callable[[Any], MapCorrection | str]
 
 
 class BackEnd:
@@ -45,13 +57,21 @@ class BackEnd:
     worker: where the work is done; by default as the settings say.
     """
 
-    def __init__(self, sensor: Sensor, config: BackendConfig, worker: Worker | None = None) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        config: BackendConfig,
+        places: PlacesConfig | None = None,
+        worker: Worker | None = None,
+    ) -> None:
         self.sensor, self.config = sensor, config
+        self._places = places or PlacesConfig()
         self.worker = worker or (ProcessWorker() if config.process else InlineWorker())
         self._question: _Question | None = None
+        self._loops: LoopDetector | None = None
         self._n_frames = 0
         self._warned = False
-        self.n_applied = self.n_refused = 0
+        self.n_applied = self.n_refused = self.n_loops = 0
 
     def take(self) -> MapCorrection | None:
         """The correction that is due, if one is; to be called once a frame, before tracking.
@@ -70,44 +90,75 @@ class BackEnd:
             return None
         self._question = None
         try:
-            solution = question.answer.result()
+            verdict = question.judge(question.answer.result())
         except Exception as error:  # of any kind: the run does not depend on it
-            self._warn(error)
+            self._warn(question.what, error)
             return None
-        reason = reason_to_refuse(question.window, solution)
-        if reason is not None:
+        if isinstance(verdict, str):
             self.n_refused += 1
-            _log.info("local bundle adjustment refused: %s", reason)
+            _log.info("%s refused: %s", question.what, verdict)
             return None
         self.n_applied += 1
-        return to_correction(question.window, solution)
+        return verdict
 
-    def after_keyframe(self, sparse_map: SparseMap) -> None:
-        """Ask for the adjustment of the map's latest keyframe and its neighbours.
+    def after_keyframe(self, sparse_map: SparseMap, features: Features) -> None:
+        """Ask what the map's latest keyframe, with these ORB features, is good for.
 
-        Does nothing while an answer is awaited. The map is copied, not changed.
+        Is it a place seen before, the pose graph is asked; else the adjustment of the keyframe and
+        its neighbours, unless an answer is awaited. The map is copied, not changed.
         """
-        config = self.config
-        if not config.local_adjustment or self._question is not None:
+        if self.config.loop_closing and self._close_loop(sparse_map, features):
             return
+        if self.config.local_adjustment and self._question is None:
+            self._adjust(sparse_map)
+
+    def _close_loop(self, sparse_map: SparseMap, features: Features) -> bool:
+        """Ask for the pose graph where the latest keyframe closes a loop that is open."""
+        if self._loops is None:
+            self._loops = LoopDetector(self.sensor, load_vocabulary(self._places.vocabulary))
+        loop = self._loops.take(sparse_map, features)
+        if loop is None or not loop.is_open:
+            return False
+        frames = [sparse_map.keyframes[k].frame_index for k in (loop.keyframe, loop.place)]
+        _log.info("loop: frame %d sees the place of frame %d", *frames)
+        graph = build_pose_graph(sparse_map, [loop])
+        due = self._due(len(graph.i) * _OBSERVATIONS_PER_EDGE)
+        answer = self.worker.submit(solve_pose_graph, graph)
+        self.n_loops += 1
+        self._question = _Question(
+            "loop closing", answer, due, lambda Ts: loop_correction(graph, Ts, loop)
+        )
+        return True
+
+    def _adjust(self, sparse_map: SparseMap) -> None:
+        config = self.config
         window = local_window(sparse_map, self.sensor, config)
         if window is None:
             return
-        n = len(window.problem.keyframe)
-        due = self._n_frames + config.latency_frames + n // config.observations_per_frame
+
+        def judge(solution: BundleSolution) -> MapCorrection | str:
+            return reason_to_refuse(window, solution) or to_correction(window, solution)
+
         answer = self.worker.submit(adjust_bundle, window.problem, config.rounds, config.iterations)
-        self._question = _Question(window, answer, due)
+        due = self._due(len(window.problem.keyframe))
+        self._question = _Question("local bundle adjustment", answer, due, judge)
+
+    def _due(self, n_observations: int) -> int:
+        """The count of frames at which the answer to a question of some size is applied."""
+        config = self.config
+        frames = config.latency_frames + n_observations // config.observations_per_frame
+        return self._n_frames + frames
 
     def close(self) -> None:
         """End the process, if there is one; an answer that is under way never comes."""
         self._question = None
         self.worker.close()
 
-    def _warn(self, error: Exception) -> None:
+    def _warn(self, what: str, error: Exception) -> None:
         """Once as a warning: what fails for good would fail at every keyframe."""
         level = logging.INFO if self._warned else logging.WARNING
         self._warned = True
-        _log.log(level, "local bundle adjustment dropped, the run goes on: %s", error)
+        _log.log(level, "%s dropped, the run goes on: %s", what, error)
 
 
 def reason_to_refuse(window: BundleWindow, solution: BundleSolution) -> str | None:

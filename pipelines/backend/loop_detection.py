@@ -43,6 +43,7 @@ _MIN_INLIERS, _MIN_SHARE = 50, 0.5  # of the guided matches, for proof
 # Houses resemble each other: two keyframes must tell the same of where the map is off
 _WITHIN = 5  # keyframes
 _SAME_SHARE, _SAME_DEG = 0.03, 1.0  # of the depth of what was seen, and of direction
+_OPEN_SHARE, _OPEN_DEG = 0.005, 0.2  # less is not worth a correction
 _SEED = 0
 
 
@@ -61,6 +62,13 @@ class LoopClosure:
     tracks: Tracks
     off: Array
     depth_m: float
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the map is off by more than a loop is measured to."""
+        seen = invert_T(self.T_world_camera) @ self.off @ self.T_world_camera
+        far_m = float(np.linalg.norm(seen[:3, 3]))
+        return far_m > _OPEN_SHARE * self.depth_m or float(rotation_angle_deg(seen)) > _OPEN_DEG
 
     def agrees_with(self, other: LoopClosure) -> bool:
         """Whether two closures move what this one sees alike."""

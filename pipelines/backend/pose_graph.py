@@ -73,9 +73,17 @@ def solve_pose_graph(graph: PoseGraph) -> Array:
     return np.stack([found.atPose3(X(k)).matrix() for k in range(len(graph.Ts_world_camera))])
 
 
-def loop_correction(graph: PoseGraph, Ts_new: Array) -> MapCorrection:
-    """The solution as a correction of the map: points go with their first keyframes."""
+def loop_correction(graph: PoseGraph, Ts_new: Array, loop: LoopClosure) -> MapCorrection:
+    """The solution as a correction of the map: points go with their first keyframes.
+
+    The loop's keyframe then sees the points of the place, too.
+    """
     rows = np.arange(len(Ts_new))
     return MapCorrection(
-        rows, graph.Ts_world_camera, Ts_new, np.empty(0, np.int64), np.empty((0, 3))
+        rows,
+        graph.Ts_world_camera,
+        Ts_new,
+        np.empty(0, np.int64),
+        np.empty((0, 3)),
+        (loop.keyframe, loop.tracks),
     )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry import invert_T, make_T, rotation_of, rotation_vector
 from pipelines.mapping.sparse_map import SparseMap
+from pipelines.observations import Tracks
 from pipelines.types import Array, FrameResult
 
 Ids = NDArray[np.int64]
@@ -25,7 +26,7 @@ class MapCorrection:
 
     shifts_m: (N, 3) how the named points move, to be added to wherever they are by now. All other
     points move with the keyframe that first saw them, keyframes that are newer than the newest one
-    named with that one.
+    named with that one. sights: a keyframe's row and the points that it sees besides its own.
     """
 
     keyframes: Ids
@@ -33,6 +34,7 @@ class MapCorrection:
     Ts_new: Array
     point_ids: Ids
     shifts_m: Array
+    sights: tuple[int, Tracks] | None = None
 
 
 def correct_map(sparse_map: SparseMap, correction: MapCorrection) -> Array:
@@ -51,6 +53,8 @@ def correct_map(sparse_map: SparseMap, correction: MapCorrection) -> Array:
     named = correction.point_ids[sparse_map.alive[correction.point_ids]]
     shifts = correction.shifts_m[sparse_map.alive[correction.point_ids]]
     sparse_map.move_points(Cs, named, shifts)
+    if correction.sights is not None:
+        sparse_map.add_sights(*correction.sights)
     return Cs[-1]
 
 

@@ -222,26 +222,44 @@ class SparseMap:
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Remember a keyframe, and work out which earlier ones see the same points."""
-        index = len(self.keyframes)
-        ids = keyframe.tracks.point_ids
+        index, ids = len(self.keyframes), keyframe.tracks.point_ids
         new = ids[self.first_keyframe[ids] < 0]
-        shared = np.zeros(index, np.int64)
-        flags = np.zeros(self._size, bool)
-        flags[ids] = True
-        for other in self.local_keyframes(ids, keyframe.T_world_camera):
-            shared[other] = flags[self.keyframes[other].tracks.point_ids].sum()
-        covisible = np.flatnonzero(shared >= self.config.min_shared_points)
-        covisible = covisible[np.argsort(-shared[covisible], kind="stable")]
-        self._covisible.append(covisible)
-        self._n_shared.append(shared[covisible])
-        for other in covisible:
-            place = np.searchsorted(-self._n_shared[other], -shared[other], side="right")
-            self._covisible[other] = np.insert(self._covisible[other], place, index)
-            self._n_shared[other] = np.insert(self._n_shared[other], place, shared[other])
+        others = self.local_keyframes(ids, keyframe.T_world_camera)
+        self._covisible.append(np.empty(0, np.int64))
+        self._n_shared.append(np.empty(0, np.int64))
         self.first_keyframe[new] = index
         self.n_keyframes[ids] += 1
         self.keyframes.append(keyframe)
         self._keyframe_Ts = np.concatenate([self._keyframe_Ts, keyframe.T_world_camera[None]])
+        self._tie(index, others)
+
+    def add_sights(self, index: int, tracks: Tracks) -> None:
+        """Let a keyframe see old points as well, as a loop has shown; who sees the same is told."""
+        keyframe = self.keyframes[index]
+        ids = tracks.point_ids
+        tracks = tracks[self.alive[ids] & ~np.isin(ids, keyframe.tracks.point_ids)]
+        self.n_keyframes[tracks.point_ids] += 1
+        self.keyframes[index] = replace(
+            keyframe, tracks=Tracks.concatenate(keyframe.tracks, tracks)
+        )
+        known = self._covisible[index]
+        others = self.local_keyframes(tracks.point_ids, keyframe.T_world_camera)
+        self._tie(index, np.setdiff1d(others, np.append(known, index)))
+
+    def _tie(self, index: int, others: Ids) -> None:
+        """Note which of some keyframes see so many points of a keyframe that they are covisible."""
+        flags = np.zeros(self._size, bool)
+        flags[self.keyframes[index].tracks.point_ids] = True
+        shared = [int(flags[self.keyframes[k].tracks.point_ids].sum()) for k in others]
+        for other, n in zip(others.tolist(), shared, strict=True):
+            if n >= self.config.min_shared_points:
+                self._note_covisible(index, other, n)
+                self._note_covisible(other, index, n)
+
+    def _note_covisible(self, index: int, other: int, n_shared: int) -> None:
+        place = np.searchsorted(-self._n_shared[index], -n_shared, side="right")
+        self._covisible[index] = np.insert(self._covisible[index], place, other)
+        self._n_shared[index] = np.insert(self._n_shared[index], place, n_shared)
 
     def covisible_keyframes(self, index: int) -> Ids:
         """Positions in `keyframes` of those covisible with keyframe `index`, most shared first."""

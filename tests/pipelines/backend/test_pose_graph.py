@@ -6,8 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from pipelines.backend.loop_detection import LoopClosure
 from pipelines.backend.pose_graph import PoseGraph, loop_correction, solve_pose_graph
 from pipelines.geometry import exp_se3, invert_T, rotation_angle_deg
+from pipelines.observations import Tracks
 
 N = 40
 
@@ -58,7 +60,9 @@ def test_the_correction_names_every_keyframe_and_no_point() -> None:
     Ts = drifted(circle())
     graph = PoseGraph(Ts, np.array([0]), np.array([1]), (invert_T(Ts[0]) @ Ts[1])[None])
     moved = exp_se3(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])) @ Ts
-    correction = loop_correction(graph, moved)
+    loop = LoopClosure(N, 0, Ts[0], Tracks.empty(), np.eye(4), 10.0)
+    correction = loop_correction(graph, moved, loop)
+    assert correction.sights == (N, loop.tracks)
     assert correction.keyframes.tolist() == list(range(N + 1))
     assert np.array_equal(correction.Ts_old, Ts) and np.array_equal(correction.Ts_new, moved)
     assert len(correction.point_ids) == 0
