@@ -20,7 +20,7 @@ import numpy as np
 
 from pipelines.backend.bundle_adjustment import BundleSolution, adjust_bundle, load_solver
 from pipelines.backend.local_window import BundleWindow, local_window, to_correction
-from pipelines.backend.loop_detection import LoopDetector
+from pipelines.backend.loop_detection import FEWEST_KEYFRAMES, LoopDetector
 from pipelines.backend.pose_graph import build_pose_graph, loop_correction, solve_pose_graph
 from pipelines.backend.vocabulary_files import load_vocabulary
 from pipelines.backend.worker import InlineWorker, ProcessWorker, Worker
@@ -70,7 +70,7 @@ class BackEnd:
         self._question: _Question | None = None
         self._loops: LoopDetector | None = None
         self._n_frames = 0
-        self._warned = False
+        self._warned = self._is_started = False
         self.n_applied = self.n_refused = self.n_loops = 0
 
     def take(self) -> MapCorrection | None:
@@ -81,7 +81,7 @@ class BackEnd:
         """
         self._n_frames += 1
         if self._n_frames == 1 and self.config.local_adjustment:
-            self.worker.submit(load_solver)  # starts the process, so that no answer waits for it
+            self._start_worker()
         question = self._question
         if question is None:
             return None
@@ -116,6 +116,8 @@ class BackEnd:
         """Ask for the pose graph where the latest keyframe closes a loop that is open."""
         if self._loops is None:
             self._loops = LoopDetector(self.sensor, load_vocabulary(self._places.vocabulary))
+        if len(sparse_map.keyframes) == FEWEST_KEYFRAMES:
+            self._start_worker()
         loop = self._loops.take(sparse_map, features)
         if loop is None or not loop.is_open:
             return False
@@ -129,6 +131,12 @@ class BackEnd:
             "loop closing", answer, due, lambda Ts: loop_correction(graph, Ts, loop)
         )
         return True
+
+    def _start_worker(self) -> None:
+        """Start the process before there is a question, so that no answer waits for that."""
+        if not self._is_started:
+            self._is_started = True
+            self.worker.submit(load_solver)
 
     def _adjust(self, sparse_map: SparseMap) -> None:
         config = self.config

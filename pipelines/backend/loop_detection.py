@@ -34,6 +34,7 @@ Ids = NDArray[np.int64]
 _ASKED = 20  # places by the score of their own
 _TRIED = 3  # places whose geometry is tried, by the score of them and their neighbours
 _RECENT = 20  # latest keyframes, which are no loops
+FEWEST_KEYFRAMES = _RECENT + 2  # before so many there can be no loop
 _NEIGHBOURS = 5  # covisible keyframes whose points a place brings
 _MAX_HAMMING, _RATIO = 64, 0.8  # of matches; best to second best (Lowe)
 _PNP_PX = 4.0  # reprojection error of an inlier: corners lie on coarse levels too

@@ -20,7 +20,7 @@ from pipelines.dyob_slam import DyObSlam
 from pipelines.geometry import exp_se3
 from pipelines.io.result import load_result
 from pipelines.runner import run
-from pipelines.types import TrackingStatus
+from pipelines.types import Features, TrackingStatus
 
 # Many keyframes, so that much is adjusted in few frames
 SETTINGS = ("backend.local_adjustment=true", "mapping.keyframe_max_interval=2")
@@ -170,10 +170,10 @@ def test_an_answer_is_applied_at_its_frame_however_soon_it_is_there(mapped) -> N
     sparse_map, sensor = mapped
     for quick in (True, False):
         worker = Slow()
-        back_end = BackEnd(sensor, BackendConfig(local_adjustment=True), worker)
+        back_end = BackEnd(sensor, BackendConfig(local_adjustment=True, loop_closing=False), worker=worker)
         assert back_end.take() is None
-        back_end.after_keyframe(sparse_map)
-        back_end.after_keyframe(sparse_map)  # one at a time
+        back_end.after_keyframe(sparse_map, Features.empty())
+        back_end.after_keyframe(sparse_map, Features.empty())  # one at a time
         assert len(worker.questions) == 1
         n = len(worker.questions[0][1][1][0].keyframe)
         if quick:
@@ -191,9 +191,9 @@ def test_an_answer_is_applied_at_its_frame_however_soon_it_is_there(mapped) -> N
 def test_without_waiting_an_answer_is_taken_when_it_comes(mapped) -> None:
     sparse_map, sensor = mapped
     worker = Slow()
-    config = BackendConfig(local_adjustment=True, wait=False)
-    back_end = BackEnd(sensor, config, worker)
-    back_end.after_keyframe(sparse_map)
+    config = BackendConfig(local_adjustment=True, loop_closing=False, wait=False)
+    back_end = BackEnd(sensor, config, worker=worker)
+    back_end.after_keyframe(sparse_map, Features.empty())
     for _ in range(30):
         assert back_end.take() is None
     worker.answer()
@@ -204,10 +204,10 @@ def test_without_waiting_an_answer_is_taken_when_it_comes(mapped) -> None:
 def test_an_answer_that_never_comes_is_dropped_with_one_warning(mapped, caplog, error) -> None:
     sparse_map, sensor = mapped
     worker = Slow()
-    back_end = BackEnd(sensor, BackendConfig(local_adjustment=True), worker)
+    back_end = BackEnd(sensor, BackendConfig(local_adjustment=True, loop_closing=False), worker=worker)
     with caplog.at_level(logging.WARNING, logger="dyob.backend"):
         for n in range(2):
-            back_end.after_keyframe(sparse_map)
+            back_end.after_keyframe(sparse_map, Features.empty())
             worker.questions[-1][0].set_exception(error)
             assert [back_end.take() for _ in range(10)] == [None] * 10
             assert len(worker.questions) == n + 1
@@ -271,8 +271,8 @@ def test_bad_solutions_are_refused_with_their_reason(solved) -> None:
 def test_a_refused_answer_leaves_the_map_alone(mapped, solved, caplog) -> None:
     _, good = solved
     worker = Slow()
-    back_end = BackEnd(mapped[1], BackendConfig(local_adjustment=True), worker)
-    back_end.after_keyframe(mapped[0])
+    back_end = BackEnd(mapped[1], BackendConfig(local_adjustment=True, loop_closing=False), worker=worker)
+    back_end.after_keyframe(mapped[0], Features.empty())
     worker.questions[-1][0].set_result(replace(good, error_after=good.error_before))
     with caplog.at_level(logging.INFO, logger="dyob.backend"):
         assert [back_end.take() for _ in range(10)] == [None] * 10
