@@ -25,6 +25,8 @@ from pipelines.types import Features, TrackingStatus
 # Many keyframes, so that much is adjusted in few frames
 SETTINGS = ("backend.local_adjustment=true", "mapping.keyframe_max_interval=2")
 
+ADJUSTING = BackendConfig(local_adjustment=True, loop_closing=False)
+
 
 class Slow:
     """A worker that answers when it is told to."""
@@ -170,7 +172,9 @@ def test_an_answer_is_applied_at_its_frame_however_soon_it_is_there(mapped) -> N
     sparse_map, sensor = mapped
     for quick in (True, False):
         worker = Slow()
-        back_end = BackEnd(sensor, BackendConfig(local_adjustment=True, loop_closing=False), worker=worker)
+        back_end = BackEnd(
+            sensor, BackendConfig(local_adjustment=True, loop_closing=False), worker=worker
+        )
         assert back_end.take() is None
         back_end.after_keyframe(sparse_map, Features.empty())
         back_end.after_keyframe(sparse_map, Features.empty())  # one at a time
@@ -204,7 +208,9 @@ def test_without_waiting_an_answer_is_taken_when_it_comes(mapped) -> None:
 def test_an_answer_that_never_comes_is_dropped_with_one_warning(mapped, caplog, error) -> None:
     sparse_map, sensor = mapped
     worker = Slow()
-    back_end = BackEnd(sensor, BackendConfig(local_adjustment=True, loop_closing=False), worker=worker)
+    back_end = BackEnd(
+        sensor, BackendConfig(local_adjustment=True, loop_closing=False), worker=worker
+    )
     with caplog.at_level(logging.WARNING, logger="dyob.backend"):
         for n in range(2):
             back_end.after_keyframe(sparse_map, Features.empty())
@@ -271,7 +277,9 @@ def test_bad_solutions_are_refused_with_their_reason(solved) -> None:
 def test_a_refused_answer_leaves_the_map_alone(mapped, solved, caplog) -> None:
     _, good = solved
     worker = Slow()
-    back_end = BackEnd(mapped[1], BackendConfig(local_adjustment=True, loop_closing=False), worker=worker)
+    back_end = BackEnd(
+        mapped[1], BackendConfig(local_adjustment=True, loop_closing=False), worker=worker
+    )
     back_end.after_keyframe(mapped[0], Features.empty())
     worker.questions[-1][0].set_result(replace(good, error_after=good.error_before))
     with caplog.at_level(logging.INFO, logger="dyob.backend"):
