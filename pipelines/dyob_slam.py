@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.backend.back_end import BackEnd
 from pipelines.backend.seen_places import SeenPlaces
 from pipelines.config import Config
 from pipelines.depth import StereoDepth
@@ -27,6 +28,7 @@ from pipelines.frontend.orb import OrbExtractor
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame, Tracker
 from pipelines.frontend.view import PreparedFrame, View, complete_view, prepare_frame
+from pipelines.mapping.correction import FrameAnchors, correct_map
 from pipelines.mapping.local_mapping import LocalMapping
 from pipelines.mapping.sightings import static_sightings
 from pipelines.mapping.sparse_map import SparseMap
@@ -88,6 +90,8 @@ class DyObSlam:
         self._flow = DenseFlow(self.config.flow)
         self._objects = ObjectTracker(self.sensor, self.config.objects, self.config.tracking.seed)
         self._geometry = MultiViewGeometry(camera, self.config.geometry)
+        self._backend = BackEnd(self.sensor, self.config.backend, self.config.places)
+        self._anchors = FrameAnchors()
         self._landmarks: set[int] = set()
         self._lost_frames = 0
         self._static_tracks = Tracks.empty()  # of the last frame
@@ -100,6 +104,9 @@ class DyObSlam:
         """
         prepared = self.prepare(frame) if isinstance(frame, Frame) else frame
         self._timings_ms = dict(prepared.timings_ms)
+        # 11. What local bundle adjustment made better; never while a frame is under way
+        with self._stage("backend"):
+            self._take_correction()
         # The noise and offset learned by now: `prepare` ran ahead and could not know them
         with self._stage("view"):
             sigma, offset = self.sensor.noise.sigma_disparity_px, self.sensor.offset.offset_px
@@ -125,6 +132,10 @@ class DyObSlam:
             if is_keyframe:
                 self._geometry.add_keyframe()
             seen = self._observations(view, tracked)
+        with self._stage("backend"):
+            self._anchors.add(self.map, view.frame_index, tracked.T_world_camera)
+            if is_keyframe:
+                self._backend.after_keyframe(self.map, prepared.features)
         self._timings_ms["total"] = sum(self._timings_ms.values())
         result = self._result(prepared.frame, tracked, is_keyframe, estimates, objects)
         return replace(result, observations=seen)
@@ -164,7 +175,27 @@ class DyObSlam:
         """The sparse static map as it stands, copied."""
         return self.map.snapshot()
 
+    def revise(self, results: Sequence[FrameResult]) -> list[FrameResult]:
+        """Results of `process`, in their order, as the map's corrections since then have them."""
+        if not self._backend.n_applied:
+            return list(results)
+        return self._anchors.revise(self.map, results)
+
+    def close(self) -> None:
+        """End the back-end's process; frames may still come, and start it again."""
+        self._backend.close()
+
     # ------------------------------------------------------------------ steps
+
+    def _take_correction(self) -> None:
+        """Let the map, and all that is remembered in the world, follow an answer that is due."""
+        correction = self._backend.take()
+        if correction is None:
+            return
+        C = correct_map(self.map, correction)
+        self._tracker.move_world(C)
+        self._objects.move_world(C)
+        self._geometry.move_world(C)
 
     def _depth(self, frame: Frame) -> NDArray[np.float32] | None:
         """(H, W) depth in m, given or by stereo; None where the frame has neither."""

@@ -108,6 +108,7 @@ def run(
                 _write(writer, sequence, slam, progress)
             raise
         finally:
+            slam.close()
             for sink in sinks:
                 sink.finish()
         if not progress.results and not progress.interrupted:
@@ -121,7 +122,7 @@ def run(
             _note_interruption(progress)
             _write(writer, sequence, slam, progress)
         note_end(known, progress.results)
-        lasting_map.keep(slam.map, progress.results)
+        lasting_map.keep(slam.map, slam.revise(progress.results))
         if config.batch.at_end and progress.results and not progress.interrupted:
             _optimise(folder, config, batch_progress)
         if progress.recorder is not None and not config.batch.record:
@@ -213,13 +214,18 @@ def _prepare_ahead(
 
 def _write(writer: ResultWriter, sequence: Sequence, slam: DyObSlam, progress: _Progress) -> None:
     """All files: first what was estimated; the truth, which may be damaged, costs only errors."""
-    static_map = slam.static_map()
-    writer.write_run(progress.results, static_map)
+    static_map, results = slam.static_map(), slam.revise(progress.results)
+    writer.write_run(results, static_map)
     if progress.recorder is not None:
-        progress.recorder.finish(static_map.track_ids)
+        corrected = {
+            now.frame_index: now.T_world_camera
+            for now, then in zip(results, progress.results, strict=True)
+            if now is not then
+        }
+        progress.recorder.finish(static_map.track_ids, corrected)
     metrics = {
         "run": run_metrics(
-            progress.results,
+            results,
             static_map,
             sequence=sequence.name,
             dataset=sequence.dataset,
@@ -231,7 +237,7 @@ def _write(writer: ResultWriter, sequence: Sequence, slam: DyObSlam, progress: _
     try:
         truth = sequence.ground_truth()
         if truth is not None:
-            writer.write_ground_truth(progress.results, truth)
+            writer.write_ground_truth(results, truth)
     except DatasetError as error:
         _log.warning("no errors can be computed, the ground truth cannot be read: %s", error)
     evaluate_result(writer.folder)

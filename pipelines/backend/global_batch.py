@@ -78,7 +78,7 @@ def run_global_batch(
     start = build_problem(
         camera,
         log,
-        objects if config.objects else ObjectEstimates.empty(),
+        objects if config.with_objects else ObjectEstimates.empty(),
         config.max_static_per_frame,
     )
     if len(start.tracks) == 0:

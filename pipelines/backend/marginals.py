@@ -5,6 +5,7 @@ Owns their axes. Points are integrated out before, as in the solver.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -54,23 +55,34 @@ def pose_covariances(
             cameras[k] = joint.at(camera_key(k), camera_key(k))
     objects = np.full((len(problem.Ts_world_object), 6, 6), np.nan)
     steps = np.full_like(objects, np.nan)
-    for stretch in problem.stretches:
-        _fill_stretch(tree, stretch, objects, steps)
+    for blocks in _together(problem.stretches):
+        joint = tree.jointMarginalCovariance([object_key(o) for block in blocks for o in block])
+        for block in blocks:
+            _fill(joint, block, objects, steps)
     return PoseCovariances(cameras, objects, steps)
 
 
-def _fill_stretch(
-    tree: gtsam.GaussianBayesTree, stretch: Stretch, objects: Array, steps: Array
-) -> None:
-    """Marginals of one stretch into the arrays (O, 6, 6), all at once: each call costs alike."""
-    first, end = stretch.poses.start, stretch.poses.stop
-    for begin in range(first, end, _AT_A_TIME):
-        block = range(max(begin - 1, first), min(begin + _AT_A_TIME, end))
-        joint = tree.jointMarginalCovariance([object_key(o) for o in block])
-        for o in block:
-            key = object_key(o)
-            objects[o] = joint.at(key, key)
-            if o > block[0]:
-                before = object_key(o - 1)
-                cross = joint.at(before, key)
-                steps[o] = objects[o] + joint.at(before, before) - cross - cross.T
+def _together(stretches: Sequence[Stretch]) -> Iterator[list[range]]:
+    """Poses of all stretches in groups for one call each; blocks of a stretch share a pose."""
+    group: list[range] = []
+    for stretch in stretches:
+        first, end = stretch.poses.start, stretch.poses.stop
+        for begin in range(first, end, _AT_A_TIME):
+            block = range(max(begin - 1, first), min(begin + _AT_A_TIME, end))
+            if group and sum(map(len, group)) + len(block) > _AT_A_TIME:
+                yield group
+                group = []
+            group.append(block)
+    if group:
+        yield group
+
+
+def _fill(joint: gtsam.JointMarginal, block: range, objects: Array, steps: Array) -> None:
+    """Marginals of the poses of one block of a stretch into the arrays (O, 6, 6)."""
+    for o in block:
+        key = object_key(o)
+        objects[o] = joint.at(key, key)
+        if o > block[0]:
+            before = object_key(o - 1)
+            cross = joint.at(before, key)
+            steps[o] = objects[o] + joint.at(before, before) - cross - cross.T

@@ -38,7 +38,8 @@ def descriptors_of(images: Iterable[Image], config: OrbConfig) -> list[Descripto
     Images (H, W) or (H, W, 3) RGB, uint8.
     """
     orb = OrbExtractor(config)
-    return [orb.extract(normalise_contrast(to_gray(image))).descriptors for image in images]
+    grays = (to_gray(image) for image in images)
+    return [orb.extract(g, detect_on=normalise_contrast(g)).descriptors for g in grays]
 
 
 def images_of(source: str, stride: int = 1) -> Iterator[Image]:

@@ -96,6 +96,13 @@ class ViewMemory:
         """Keep a view for long."""
         self._keyframes.append(reference)
 
+    def move_world(self, C: Array) -> None:
+        """Let all views follow a correction of the map: p_new = C (4, 4) @ p_old."""
+        for views in (self._recent, self._keyframes):
+            moved = [replace(view, T_world_camera=C @ view.T_world_camera) for view in views]
+            views.clear()
+            views.extend(moved)
+
     def overlapping(self, timestamp_s: float, T_world_camera: Array) -> list[Reference]:
         """The views that overlap most with one at this pose: near in place and in direction.
 

@@ -7,7 +7,7 @@ Owns the order of the tests and what they add up to; the tests themselves are in
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -81,6 +81,16 @@ class MultiViewGeometry:
         """Remember the view last segmented for long: call it where the map makes a keyframe."""
         if self._last_static is not None:
             self._memory.add_keyframe(self._last_static)
+
+    def move_world(self, C: Array) -> None:
+        """Let what is remembered follow a correction of the map: p_new = C (4, 4) @ p_old."""
+        self._memory.move_world(C)
+        if self._last is not None:
+            view, cells = self._last
+            self._last = (replace(view, T_world_camera=C @ view.T_world_camera), cells)
+        if self._last_static is not None:
+            last = self._last_static
+            self._last_static = replace(last, T_world_camera=C @ last.T_world_camera)
 
     def rename(self, names: Mapping[int, int]) -> None:
         """Call instances of the last answer by the labels that they have from now on.

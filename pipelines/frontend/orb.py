@@ -37,15 +37,21 @@ class OrbExtractor:
         )
 
     def extract(
-        self, gray: Image, static: NDArray[np.bool_] | None = None, movable_too: bool = False
+        self,
+        gray: Image,
+        static: NDArray[np.bool_] | None = None,
+        movable_too: bool = False,
+        detect_on: Image | None = None,
     ) -> Features:
         """ORB features of a grey image (H, W): the strongest of each image cell.
 
         static: (H, W) bool, about `n_features` lie where it is True. movable_too: as many more as
-        the rest has room for at the same density. Depths are left unknown (NaN).
+        the rest has room for at the same density. detect_on: (H, W) uint8, what corners and their
+        angles are found on, if not on the image that is described. Depths are left unknown (NaN).
         """
         self._orb.setNLevels(self._levels_that_fit(gray.shape))
-        corners = self._orb.detect(gray, None)  # masking afterwards is faster
+        searched = gray if detect_on is None else detect_on
+        corners = self._orb.detect(searched, None)  # masking afterwards is faster
         if not corners:
             return Features.empty()
         uv = cv2.KeyPoint_convert(corners).astype(np.float64)

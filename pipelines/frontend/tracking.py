@@ -115,6 +115,11 @@ class Tracker:
         if self._last is not None:
             self._last = replace(self._last, flow_starts_here=False)
 
+    def move_world(self, C: Array) -> None:
+        """Let what is remembered follow a correction of the map: p_new = C (4, 4) @ p_old."""
+        if self.motion is not None:
+            self.motion.T_world_camera = C @ self.motion.T_world_camera
+
     # -------------------------------------------------------------- tracking
 
     def track(self, view: View, sparse_map: SparseMap, stage: Stage | None = None) -> TrackedFrame:

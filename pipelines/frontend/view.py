@@ -84,6 +84,7 @@ def static_pixels(
 def normalise_contrast(gray: Image) -> Image:
     """(H, W) uint8 with even local contrast, so that corners in shade or on asphalt count too.
 
+    Only for detection: the gain changes across a patch, and with it what is brighter than what.
     Deviation: the paper detects ORB on the plain image, which leaves the ground nearly bare.
     """
     half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # smooth anyway
@@ -142,7 +143,7 @@ def prepare_frame(
     labels = None if detections is None else detections.labels
     static = static_pixels(labels, gray.shape, orb.config.mask_dilation_px)
     movable_too = float(static.mean()) < movable_below
-    features = orb.extract(normalise_contrast(gray), static, movable_too)
+    features = orb.extract(gray, static, movable_too, detect_on=normalise_contrast(gray))
     return PreparedFrame(frame, gray, disparity, features, detections)
 
 

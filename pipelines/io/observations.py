@@ -1,15 +1,17 @@
 """The observation log on disk: what every frame saw, in chunks of frames, for the batch.
 
 Owns the layout of the folder `observations/`: `000000.npz` and so on, each with some frames' poses
-and sightings, `camera.json`, and `map_points.npz`, which point of the saved map is which track.
+and sightings, `camera.json`, `map_points.npz`, which point of the saved map is which track, and
+`poses.npz`, the cameras as they were at the end of the run.
 numpy arrays alone, read without pickle. Knows no result folder.
 """
 
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +20,14 @@ from numpy.typing import NDArray
 from pipelines.errors import DyObError, FormatError
 from pipelines.frame_observations import FrameObservations, Sightings
 from pipelines.io.files import disk_error, read_json, replacing, write_json
-from pipelines.types import StereoCamera
+from pipelines.types import Array, StereoCamera
 
 FRAMES_A_CHUNK = 50
 VERSION = 1
 MAP_POINTS = "map_points.npz"
+POSES = "poses.npz"
 CAMERA = "camera.json"
+_OTHERS = (MAP_POINTS, POSES, CAMERA)
 _SINGLE = ("uv_px", "disparity_px", "sigma_uv_px", "sigma_disparity_px", "position_m")  # float32
 _FRAMES = ("frame_index", "timestamp_s", "is_tracked", "T_world_camera", "n_sightings")
 _PREFIX = "sighting_"
@@ -52,11 +56,26 @@ class ObservationRecorder:
         if len(self._pending) >= FRAMES_A_CHUNK:
             self._flush()
 
-    def finish(self, map_track_ids: NDArray[np.int64] | None = None) -> None:
-        """Write what is not on the disk yet, and which track each point of the saved map is."""
+    def finish(
+        self,
+        map_track_ids: NDArray[np.int64] | None = None,
+        Ts_world_camera: Mapping[int, Array] | None = None,
+    ) -> None:
+        """Write what is not on the disk yet, and which track each point of the saved map is.
+
+        Ts_world_camera: frame index -> (4, 4) where frames were corrected since they were added.
+        """
         self._flush()
         if map_track_ids is not None:
             write_map_points(self.folder, map_track_ids)
+        if Ts_world_camera:
+            with replacing(self.folder / POSES) as fresh:
+                np.savez_compressed(
+                    fresh,
+                    version=np.int64(VERSION),
+                    frame_index=np.array(list(Ts_world_camera), np.int64),
+                    T_world_camera=np.array(list(Ts_world_camera.values()), float),
+                )
 
     def remove(self) -> None:
         """Leave nothing behind: the log was wanted for the run's own batch alone."""
@@ -76,7 +95,7 @@ def clear_observations(folder: Path | str) -> None:
     """Remove the log of an earlier run. Raises DyObError where the disk refuses."""
     folder = Path(folder)
     try:
-        for path in [*folder.glob("[0-9]*.npz"), folder / MAP_POINTS, folder / CAMERA]:
+        for path in [*folder.glob("[0-9]*.npz"), *(folder / name for name in _OTHERS)]:
             path.unlink(missing_ok=True)
     except OSError as error:
         raise DyObError(disk_error(folder, error)) from error
@@ -106,7 +125,25 @@ def read_observations(folder: Path | str) -> list[FrameObservations]:
     frames: list[FrameObservations] = []
     for path in sorted(Path(folder).glob("[0-9]*.npz")):
         frames += _read_chunk(path)
-    return frames
+    corrected = _read_poses(Path(folder) / POSES)
+    return [
+        replace(f, T_world_camera=corrected.get(f.frame_index, f.T_world_camera)) for f in frames
+    ]
+
+
+def _read_poses(path: Path) -> dict[int, Array]:
+    """Frame index -> T_world_camera (4, 4), empty where no frame was corrected."""
+    if not path.exists():
+        return {}
+    arrays = _load(path)
+    try:
+        index, Ts = arrays["frame_index"].tolist(), arrays["T_world_camera"].reshape(-1, 4, 4)
+        return dict(zip(index, Ts, strict=True))
+    except (KeyError, ValueError, AttributeError) as error:
+        raise FormatError(
+            f"{path}: expected an index and a pose of each frame, found other arrays ({error}); "
+            "run the sequence again"
+        ) from error
 
 
 def read_camera(folder: Path | str) -> StereoCamera:

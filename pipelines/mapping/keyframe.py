@@ -16,7 +16,8 @@ class Keyframe:
     """A remembered frame: its pose, the map points it sees, and its features that see none yet.
 
     T_world_camera: (4, 4) as it was when the frame was tracked. tracks: the map points seen.
-    free_features: ORB features that observe no map point.
+    free_features: ORB features that observe no map point. disparity_offset_px: what its disparities
+    were corrected by when they were read.
     """
 
     frame_index: int
@@ -24,6 +25,7 @@ class Keyframe:
     T_world_camera: Array
     tracks: Tracks
     free_features: Features
+    disparity_offset_px: float = 0.0
 
 
 def needs_keyframe(

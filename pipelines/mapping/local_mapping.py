@@ -182,7 +182,10 @@ class LocalMapping:
             )
             tracks = Tracks.concatenate(tracks, new)
             free = free[~used]
-        sparse_map.add_keyframe(Keyframe(view.frame_index, view.timestamp_s, T, tracks, free))
+        offset_px = self.sensor.offset.offset_px
+        sparse_map.add_keyframe(
+            Keyframe(view.frame_index, view.timestamp_s, T, tracks, free, offset_px)
+        )
         return tracks
 
     def _triangulation_partners(

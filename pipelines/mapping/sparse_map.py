@@ -7,6 +7,7 @@ nothing itself; `point_filter` and `triangulation` hold the formulas.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -225,26 +226,44 @@ class SparseMap:
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Remember a keyframe, and work out which earlier ones see the same points."""
-        index = len(self.keyframes)
-        ids = keyframe.tracks.point_ids
+        index, ids = len(self.keyframes), keyframe.tracks.point_ids
         new = ids[self.first_keyframe[ids] < 0]
-        shared = np.zeros(index, np.int64)
-        flags = np.zeros(self._size, bool)
-        flags[ids] = True
-        for other in self.local_keyframes(ids, keyframe.T_world_camera):
-            shared[other] = flags[self.keyframes[other].tracks.point_ids].sum()
-        covisible = np.flatnonzero(shared >= self.config.min_shared_points)
-        covisible = covisible[np.argsort(-shared[covisible], kind="stable")]
-        self._covisible.append(covisible)
-        self._n_shared.append(shared[covisible])
-        for other in covisible:
-            place = np.searchsorted(-self._n_shared[other], -shared[other], side="right")
-            self._covisible[other] = np.insert(self._covisible[other], place, index)
-            self._n_shared[other] = np.insert(self._n_shared[other], place, shared[other])
+        others = self.local_keyframes(ids, keyframe.T_world_camera)
+        self._covisible.append(np.empty(0, np.int64))
+        self._n_shared.append(np.empty(0, np.int64))
         self.first_keyframe[new] = index
         self.n_keyframes[ids] += 1
         self.keyframes.append(keyframe)
         self._keyframe_Ts = np.concatenate([self._keyframe_Ts, keyframe.T_world_camera[None]])
+        self._tie(index, others)
+
+    def add_sights(self, index: int, tracks: Tracks) -> None:
+        """Let a keyframe see old points as well, as a loop has shown; who sees the same is told."""
+        keyframe = self.keyframes[index]
+        ids = tracks.point_ids
+        tracks = tracks[self.alive[ids] & ~np.isin(ids, keyframe.tracks.point_ids)]
+        self.n_keyframes[tracks.point_ids] += 1
+        self.keyframes[index] = replace(
+            keyframe, tracks=Tracks.concatenate(keyframe.tracks, tracks)
+        )
+        known = self._covisible[index]
+        others = self.local_keyframes(tracks.point_ids, keyframe.T_world_camera)
+        self._tie(index, np.setdiff1d(others, np.append(known, index)))
+
+    def _tie(self, index: int, others: Ids) -> None:
+        """Note which of some keyframes see so many points of a keyframe that they are covisible."""
+        flags = np.zeros(self._size, bool)
+        flags[self.keyframes[index].tracks.point_ids] = True
+        shared = [int(flags[self.keyframes[k].tracks.point_ids].sum()) for k in others]
+        for other, n in zip(others.tolist(), shared, strict=True):
+            if n >= self.config.min_shared_points:
+                self._note_covisible(index, other, n)
+                self._note_covisible(other, index, n)
+
+    def _note_covisible(self, index: int, other: int, n_shared: int) -> None:
+        place = np.searchsorted(-self._n_shared[index], -n_shared, side="right")
+        self._covisible[index] = np.insert(self._covisible[index], place, other)
+        self._n_shared[index] = np.insert(self._n_shared[index], place, n_shared)
 
     def covisible_keyframes(self, index: int) -> Ids:
         """Positions in `keyframes` of those covisible with keyframe `index`, most shared first."""
@@ -292,6 +311,32 @@ class SparseMap:
         uv = project_stereo(self.camera, points)[:, :2]
         inside = inside_image(self.camera, uv)
         return ids[inside], uv[inside]
+
+    # ----------------------------------------------------------- corrections
+
+    def move_keyframe(self, index: int, T_world_camera: Array) -> None:
+        """Put a keyframe elsewhere; its points stay."""
+        self.keyframes[index] = replace(self.keyframes[index], T_world_camera=T_world_camera)
+        self._keyframe_Ts[index] = T_world_camera
+
+    def move_points(self, Cs: Array, ids: Ids, shifts_m: Array) -> None:
+        """Move each point by the motion of its first keyframe, but named ones by their own shifts.
+
+        Cs: (K, 4, 4) p_new = C @ p_old, of all keyframes; points that no keyframe has seen yet go
+        with the last. ids: (N,) of the points with shifts (N, 3) in m.
+        """
+        first = self.first_keyframe[: self._size]
+        changed = np.abs(Cs - np.eye(4)).max(axis=(1, 2)) > 0
+        rows = np.flatnonzero(self.alive[: self._size] & changed[first])
+        named = np.zeros(self._size, bool)
+        named[ids] = True
+        by = first[rows]
+        R, t = Cs[by, :3, :3], Cs[by, :3, 3]
+        position = np.einsum("nij,nj->ni", R, self.position_m[rows]) + t
+        self.position_m[rows] = np.where(named[rows, None], self.position_m[rows], position)
+        self.position_m[ids] += shifts_m
+        self.covariance_m2[rows] = R @ self.covariance_m2[rows] @ R.transpose(0, 2, 1)
+        self.offset_slope[rows] = np.einsum("nij,nj->ni", R, self.offset_slope[rows])
 
     # --------------------------------------------------------------- outside
 

@@ -74,6 +74,14 @@ class ObjectFilter:
         G = np.vstack([0.5 * dt_s**2 * np.eye(3), dt_s * np.eye(3)])
         self._kf.predict(F=F, Q=self._acceleration**2 * G @ G.T)
 
+    def move_world(self, C: Array) -> None:
+        """Follow a correction of the map: p_new = C (4, 4) @ p_old."""
+        R = np.kron(np.eye(2), C[:3, :3])
+        self._kf.x = R @ self._kf.x
+        self._kf.x[:3] += C[:3, 3]
+        self._kf.P = R @ self._kf.P @ R.T
+        self.turn_radps = C[:3, :3] @ self.turn_radps
+
     def coast(self, dt_s: float, unmeasured_s: float) -> None:
         """Move on by a time as what moves does when its motion is not measured, since a while.
 

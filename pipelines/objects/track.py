@@ -149,6 +149,17 @@ class ObjectTrack:
         since = self.still_since_s
         return since is not None and timestamp_s - since >= self.config.still_after_s
 
+    def move_world(self, C: Array) -> None:
+        """Follow a correction of the map: p_new = C (4, 4) @ p_old."""
+        if self.filter is not None:
+            self.filter.move_world(C)
+        if self.T_world_object is not None:
+            self.T_world_object = C @ self.T_world_object
+        if self.H_world_curr_prev is not None:
+            self.H_world_curr_prev = C @ self.H_world_curr_prev @ invert_T(C)
+            R = np.kron(np.eye(2), C[:3, :3])
+            self.H_covariance = R @ self.H_covariance @ R.T
+
     def predicted_motion(self, dt_s: float) -> Array:
         """H (4, 4) over a time: the last motion goes on, else what the filter says.
 

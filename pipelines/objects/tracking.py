@@ -6,6 +6,8 @@ computes is in the modules beside this one. Ground truth never comes near.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -190,6 +192,13 @@ class ObjectTracker:
     def landmark_ids(self, timestamp_s: float) -> list[int]:
         """Objects that have stood still for so long that the camera may rely on them."""
         return [i for i, track in self.tracks.items() if track.is_landmark(timestamp_s)]
+
+    def move_world(self, C: Array) -> None:
+        """Let all objects follow a correction of the map: p_new = C (4, 4) @ p_old."""
+        for track in self.tracks.values():
+            track.move_world(C)
+        if self._last is not None:
+            self._last = replace(self._last, T_world_camera=C @ self._last.T_world_camera)
 
     # ------------------------------------------------------------- following
 

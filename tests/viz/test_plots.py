@@ -20,12 +20,13 @@ from viz.plots import plot_result
 def write(folder, n: int, *, truth: bool, timings: bool = True) -> None:
     step = exp_se3(np.array([0.0, 0.05, 0.0, 0.0, 0.0, 1.0]))
     Ts = np.array([np.linalg.matrix_power(step, k) for k in range(n)]).reshape(-1, 4, 4)
+    errors = exp_se3(np.random.default_rng(0).normal(0.0, 1e-3, (n, 6)))
     results = [
         FrameResult(
             frame_index=k,
             timestamp_s=0.1 * k,
             status=TrackingStatus.LOST if k == 7 else TrackingStatus.OK,
-            T_world_camera=T,
+            T_world_camera=T @ error,
             pose_covariance=np.eye(6),
             hypothesis=MotionHypothesis.NONE,
             is_keyframe=False,
@@ -35,7 +36,7 @@ def write(folder, n: int, *, truth: bool, timings: bool = True) -> None:
             reprojection_rmse_px=0.0,
             timings_ms={"orb": 9.0, "total": 12.0 + k % 3} if timings else {},
         )
-        for k, T in enumerate(Ts)
+        for k, (T, error) in enumerate(zip(Ts, errors, strict=True))
     ]
     writer = ResultWriter(folder)
     writer.write_camera(results)

@@ -36,7 +36,8 @@ def orb() -> OrbExtractor:
 
 
 def features_of(orb: OrbExtractor, image: Image) -> Features:
-    return orb.extract(normalise_contrast(to_gray(image)))
+    gray = to_gray(image)
+    return orb.extract(gray, detect_on=normalise_contrast(gray))
 
 
 def bag_of(vocabulary: Vocabulary, orb: OrbExtractor, image: Image):

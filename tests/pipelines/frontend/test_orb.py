@@ -113,6 +113,17 @@ def test_descriptors_recognise_a_shifted_image():
     assert np.median(bits) < 16
 
 
+def test_corners_of_one_image_are_described_on_another():
+    gray = half_faint()
+    extractor = OrbExtractor(CONFIG)
+    plain = extractor.extract(gray)
+    both = extractor.extract(255 - gray, detect_on=gray)
+    np.testing.assert_array_equal(both.uv_px, plain.uv_px)
+    np.testing.assert_array_equal(both.angle_deg, plain.angle_deg)
+    differing = np.unpackbits(both.descriptors ^ plain.descriptors, axis=1).mean()
+    assert 0.9 < differing < 1.0  # what was brighter is darker; ties stay as they are
+
+
 def test_spreading_takes_the_strongest_of_each_cell_first():
     rng = np.random.default_rng(3)
     uv = np.vstack([rng.uniform(0, 60, (900, 2)), rng.uniform(0, [500, 300], (100, 2))])

@@ -53,6 +53,23 @@ def test_round_trip_over_several_chunks(tmp_path, monkeypatch):
             np.testing.assert_allclose(b, a, rtol=1e-6, err_msg=name)
 
 
+def test_poses_that_were_corrected_since_come_back_corrected(tmp_path):
+    recorder = ObservationRecorder(tmp_path, CAMERA)
+    for frame in make_frames(4):
+        recorder.add(frame)
+    T = np.eye(4)
+    T[:3, 3] = (1.0, 2.0, 3.0)
+    recorder.finish(None, {2: T})
+    back = read_observations(tmp_path)
+    for k, frame in enumerate(back):
+        np.testing.assert_array_equal(frame.T_world_camera, T if k == 2 else np.eye(4))
+    ObservationRecorder(tmp_path, CAMERA)  # the next run's log knows nothing of them
+    assert not (tmp_path / log_files.POSES).exists()
+    (tmp_path / log_files.POSES).write_bytes(b"no arrays")
+    with pytest.raises(FormatError, match="observations"):
+        read_observations(tmp_path)
+
+
 def test_damage_is_a_format_error(tmp_path):
     recorder = ObservationRecorder(tmp_path, CAMERA)
     recorder.add(make_frames(1)[0])

@@ -1,0 +1,196 @@
+"""Bundle adjustment and loops beside tracking: when they are asked, when an answer moves the map.
+
+Owns the one question that is under way and the judgement of its answer. What is adjusted is chosen
+by `local_window` and solved by `bundle_adjustment`; loops are found by `loop_detection` and closed
+by `pose_graph`; `mapping.correction` moves the map. A loop goes before an adjustment.
+
+An answer is applied a fixed number of frames after its question, however soon it is there: so the
+same run moves the same map at the same frame, in a process or in this one.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipelines.backend.bundle_adjustment import BundleSolution, adjust_bundle, load_solver
+from pipelines.backend.local_window import BundleWindow, local_window, to_correction
+from pipelines.backend.loop_detection import FEWEST_KEYFRAMES, LoopDetector
+from pipelines.backend.pose_graph import build_pose_graph, loop_correction, solve_pose_graph
+from pipelines.backend.vocabulary_files import load_vocabulary
+from pipelines.backend.worker import InlineWorker, ProcessWorker, Worker
+from pipelines.config import BackendConfig, PlacesConfig
+from pipelines.frontend.sensor import Sensor
+from pipelines.geometry import invert_T, rotation_angle_deg
+from pipelines.mapping.correction import MapCorrection
+from pipelines.mapping.sparse_map import SparseMap
+from pipelines.types import Features
+
+_MIN_AGREEING = 0.5  # share of observations; where fewer agree, something else is wrong
+_MAX_MOVE_M, _MAX_MOVE_SHARE = 0.05, 0.02  # of a keyframe, and of its way from the held ones
+_MAX_TURN_DEG = 0.5  # of a keyframe
+_OBSERVATIONS_PER_EDGE = 3  # what an edge of the pose graph costs, in observations
+_log = logging.getLogger("dyob.backend")
+
+
+@dataclass(frozen=True, slots=True)
+class _Question:
+    """Work under way. what: for people. due: the count of frames at which its answer is applied.
+
+    judge: makes a correction of the answer, or says why it is refused.
+    """
+
+    what: str
+    answer: Future[Any]
+    due: int
+    judge: Callable[[Any], MapCorrection | str]
+
+
+class BackEnd:
+    """Improves the latest keyframes and their points while tracking goes on.
+
+    worker: where the work is done; by default as the settings say.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        config: BackendConfig,
+        places: PlacesConfig | None = None,
+        worker: Worker | None = None,
+    ) -> None:
+        self.sensor, self.config = sensor, config
+        self._places = places or PlacesConfig()
+        self.worker = worker or (ProcessWorker() if config.process else InlineWorker())
+        self._question: _Question | None = None
+        self._loops: LoopDetector | None = None
+        self._n_frames = 0
+        self._warned = self._is_started = False
+        self.n_applied = self.n_refused = self.n_loops = 0
+
+    def take(self) -> MapCorrection | None:
+        """The correction that is due, if one is; to be called once a frame, before tracking.
+
+        Waits for an answer that is late, unless `wait` is false. Answers that would make the map
+        worse, and those that never came, are dropped.
+        """
+        self._n_frames += 1
+        if self._n_frames == 1 and self.config.local_adjustment:
+            self._start_worker()
+        question = self._question
+        if question is None:
+            return None
+        late = self._n_frames >= question.due
+        if not (late if self.config.wait else question.answer.done()):
+            return None
+        self._question = None
+        try:
+            verdict = question.judge(question.answer.result())
+        except Exception as error:  # of any kind: the run does not depend on it
+            self._warn(question.what, error)
+            return None
+        if isinstance(verdict, str):
+            self.n_refused += 1
+            _log.info("%s refused: %s", question.what, verdict)
+            return None
+        self.n_applied += 1
+        return verdict
+
+    def after_keyframe(self, sparse_map: SparseMap, features: Features) -> None:
+        """Ask what the map's latest keyframe, with these ORB features, is good for.
+
+        Is it a place seen before, the pose graph is asked; else the adjustment of the keyframe and
+        its neighbours, unless an answer is awaited. The map is copied, not changed.
+        """
+        if self.config.loop_closing and self._close_loop(sparse_map, features):
+            return
+        if self.config.local_adjustment and self._question is None:
+            self._adjust(sparse_map)
+
+    def _close_loop(self, sparse_map: SparseMap, features: Features) -> bool:
+        """Ask for the pose graph where the latest keyframe closes a loop that is open."""
+        if self._loops is None:
+            self._loops = LoopDetector(self.sensor, load_vocabulary(self._places.vocabulary))
+        if len(sparse_map.keyframes) == FEWEST_KEYFRAMES:
+            self._start_worker()
+        loop = self._loops.take(sparse_map, features)
+        if loop is None or not loop.is_open:
+            return False
+        frames = [sparse_map.keyframes[k].frame_index for k in (loop.keyframe, loop.place)]
+        _log.info("loop: frame %d sees the place of frame %d", *frames)
+        graph = build_pose_graph(sparse_map, [loop])
+        due = self._due(len(graph.i) * _OBSERVATIONS_PER_EDGE)
+        answer = self.worker.submit(solve_pose_graph, graph)
+        self.n_loops += 1
+        self._question = _Question(
+            "loop closing", answer, due, lambda Ts: loop_correction(graph, Ts, loop)
+        )
+        return True
+
+    def _start_worker(self) -> None:
+        """Start the process before there is a question, so that no answer waits for that."""
+        if not self._is_started:
+            self._is_started = True
+            self.worker.submit(load_solver)
+
+    def _adjust(self, sparse_map: SparseMap) -> None:
+        config = self.config
+        window = local_window(sparse_map, self.sensor, config)
+        if window is None:
+            return
+
+        def judge(solution: BundleSolution) -> MapCorrection | str:
+            return reason_to_refuse(window, solution) or to_correction(window, solution)
+
+        answer = self.worker.submit(adjust_bundle, window.problem, config.rounds, config.iterations)
+        due = self._due(len(window.problem.keyframe))
+        self._question = _Question("local bundle adjustment", answer, due, judge)
+
+    def _due(self, n_observations: int) -> int:
+        """The count of frames at which the answer to a question of some size is applied."""
+        config = self.config
+        frames = config.latency_frames + n_observations // config.observations_per_frame
+        return self._n_frames + frames
+
+    def close(self) -> None:
+        """End the process, if there is one; an answer that is under way never comes."""
+        self._question = None
+        self.worker.close()
+
+    def _warn(self, what: str, error: Exception) -> None:
+        """Once as a warning: what fails for good would fail at every keyframe."""
+        level = logging.INFO if self._warned else logging.WARNING
+        self._warned = True
+        _log.log(level, "%s dropped, the run goes on: %s", what, error)
+
+
+def reason_to_refuse(window: BundleWindow, solution: BundleSolution) -> str | None:
+    """Why a solution is not believed, None where it is.
+
+    It must lower the error of the observations that agree in the end, most must agree, and no
+    keyframe may jump: beyond 5 cm and 2 % of its way from the nearest held one, or by half a
+    degree, which is far more than tracking errs by among neighbours.
+    """
+    problem = window.problem
+    if not np.isfinite(solution.Ts_world_camera).all():
+        return "its poses are not finite"
+    if not solution.error_after < solution.error_before:
+        return f"error {solution.error_before:.1f} before, {solution.error_after:.1f} after"
+    share = float(solution.inliers.mean())
+    if share < _MIN_AGREEING:
+        return f"only {share:.0%} of the observations agree with it"
+    Ts_old, Ts_new = problem.Ts_world_camera, solution.Ts_world_camera
+    moved_m = np.linalg.norm(Ts_new[:, :3, 3] - Ts_old[:, :3, 3], axis=1)
+    centers_m = Ts_old[:, :3, 3]
+    way_m = np.linalg.norm(centers_m[:, None] - centers_m[problem.held], axis=2).min(axis=1)
+    if (moved_m > _MAX_MOVE_M + _MAX_MOVE_SHARE * way_m).any():
+        return f"a keyframe would move by {moved_m.max():.3f} m"
+    turned_deg = rotation_angle_deg(invert_T(Ts_old) @ Ts_new)
+    if (turned_deg > _MAX_TURN_DEG).any():
+        return f"a keyframe would turn by {turned_deg.max():.2f} deg"
+    return None

@@ -1,0 +1,82 @@
+"""Loops found again in rendered images, and none where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.backend import loop_detection
+from pipelines.backend.loop_detection import LoopDetector
+from pipelines.backend.vocabulary_files import load_vocabulary
+from pipelines.datasets.simulated.sequence import SimulatedSequence
+from pipelines.dyob_slam import DyObSlam
+from pipelines.geometry import exp_se3, rotation_angle_deg
+from pipelines.mapping.keyframe import Keyframe
+from pipelines.observations import Tracks
+from pipelines.types import Features
+
+DRIFT = exp_se3(np.array([0.0, 0.02, 0.0, 0.3, 0.0, 0.2]))
+
+
+@pytest.fixture(scope="module")
+def mapped():
+    """A map of some frames, the detector that has seen them, and their features."""
+    sequence = SimulatedSequence("static", frames=12, scale=0.5)
+    slam = DyObSlam(sequence.camera)
+    detector = LoopDetector(slam.sensor, load_vocabulary())
+    features = []
+    for index in range(12):
+        prepared = slam.prepare(sequence.read(index))
+        if slam.process(prepared).is_keyframe:
+            assert detector.take(slam.map, prepared.features) is None
+        features.append(prepared.features)
+    return sequence, slam, detector, features
+
+
+def come_again(slam: DyObSlam, T: np.ndarray) -> None:
+    """A keyframe that tracking led to a drifted pose, where it knew no point."""
+    last = slam.map.keyframes[-1]
+    index, stamp = last.frame_index + 1, last.timestamp_s + 0.1
+    slam.map.add_keyframe(Keyframe(index, stamp, T, Tracks.empty(), Features.empty()))
+
+
+def test_a_place_seen_again_is_found_where_it_is(mapped, monkeypatch) -> None:
+    sequence, slam, detector, features = mapped
+    monkeypatch.setattr(loop_detection, "_RECENT", 1)
+    truth = sequence.ground_truth().Ts_world_camera
+    truth = np.linalg.inv(truth[0]) @ truth
+    come_again(slam, DRIFT @ truth[1])
+    assert detector.take(slam.map, features[1]) is None  # one alone is no proof
+    come_again(slam, DRIFT @ truth[2])
+    closure = detector.take(slam.map, features[2])
+    assert closure is not None
+    assert slam.map.keyframes[closure.place].frame_index < 12
+    error = np.linalg.inv(truth[2]) @ closure.T_world_camera
+    assert 1e-6 < np.linalg.norm(error[:3, 3]) < 0.05
+    assert rotation_angle_deg(error) < 0.2
+    assert len(closure.tracks) >= 50
+    assert np.abs(closure.off @ DRIFT - np.eye(4)).max() < 0.05
+
+
+def test_places_that_disagree_are_no_loop(mapped, monkeypatch) -> None:
+    sequence, slam, detector, features = mapped
+    monkeypatch.setattr(loop_detection, "_RECENT", 1)
+    truth = sequence.ground_truth().Ts_world_camera
+    truth = np.linalg.inv(truth[0]) @ truth
+    aside = exp_se3(np.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0]))
+    come_again(slam, DRIFT @ truth[3])
+    assert detector.take(slam.map, features[3]) is None
+    come_again(slam, aside @ truth[4])
+    assert detector.take(slam.map, features[4]) is None
+
+
+def test_what_was_never_seen_is_no_loop(mapped, monkeypatch) -> None:
+    _, slam, detector, features = mapped
+    monkeypatch.setattr(loop_detection, "_RECENT", 1)
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, features[1].descriptors.shape, dtype=np.uint8)
+    for _ in range(2):
+        come_again(slam, np.eye(4))
+        assert detector.take(slam.map, replace(features[1], descriptors=noise)) is None
