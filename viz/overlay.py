@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import queue
 import threading
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -30,6 +31,7 @@ from viz.object_marks import (
     object_counts,
 )
 
+_WAKE_S = 0.5  # s, after which a thread that should be at its end is called again
 logger = logging.getLogger("dyob.viz")
 
 
@@ -188,6 +190,7 @@ class FrameWriter:
                 f"{self.folder}: expected a folder for annotated frames, found '{error.strerror}'; "
                 "choose another --output"
             ) from error
+        self._queue = queue.Queue(self.WAITING)
         self._thread = threading.Thread(target=self._write_all, name="frame-writer", daemon=True)
         self._thread.start()
 
@@ -202,10 +205,14 @@ class FrameWriter:
 
     def finish(self) -> None:
         """Wait until all that was handed over is written."""
-        if self._thread is not None:
-            self._queue.put(None)
-            self._thread.join()
-            self._thread = None
+        if self._thread is None:
+            return
+        self._queue.put(None)
+        while self._thread.is_alive():
+            self._thread.join(_WAKE_S)
+            with suppress(queue.Full):  # Ctrl-C within a `put` may have cost its wake-up call
+                self._queue.put_nowait(None)
+        self._thread = None
 
     def _write_all(self) -> None:
         while (item := self._queue.get()) is not None:

@@ -1,5 +1,6 @@
 """Annotated frames: every mark at its pixel in its colour, and the sink that writes them."""
 
+import time
 from dataclasses import replace
 
 import cv2
@@ -138,3 +139,22 @@ def test_finish_without_start(tmp_path):
 def test_unknown_picture_format(tmp_path):
     with pytest.raises(DyObError, match=r"expected \.png or \.jpg"):
         write_image(tmp_path / "a.nonsense", np.zeros((4, 4, 3), np.uint8))
+
+
+def test_a_lost_wake_up_call_does_not_hang_the_end(tmp_path, monkeypatch) -> None:
+    """As when Ctrl-C falls into the queue's `put`: the item is there, and nobody is told."""
+    writer = FrameWriter()
+    writer.start(None, 1, None, tmp_path)
+    put, lost = writer._queue.put, []
+
+    def put_quietly(item, block=True, timeout=None):
+        if not lost:
+            lost.append(item)
+            writer._queue.queue.append(item)
+        else:
+            put(item, block, timeout)
+
+    time.sleep(0.1)  # the thread waits by now
+    monkeypatch.setattr(writer._queue, "put", put_quietly)
+    writer.finish()
+    assert lost == [None]
