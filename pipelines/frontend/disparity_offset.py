@@ -23,7 +23,7 @@ from pipelines.geometry import (
 from pipelines.observations import StereoObservations
 from pipelines.types import Array, StereoCamera
 
-_PRIOR_SIGMA_PX = 0.25  # a rectified pair is off by less than this
+_PRIOR_SIGMA_PX = 0.25  # rectified pairs are off by about as much
 _INDEPENDENT_SHARE = 0.05  # errors of the same points in consecutive frames are alike
 _SIGNIFICANT_SIGMAS = 1.0  # a smaller offset is not told from none
 _SIGNIFICANT_PX = 0.1  # nor is a smaller one told from the bias of computed flow

@@ -128,7 +128,7 @@ def test_a_camera_that_stands_still_learns_nothing():
 def test_nothing_learned_is_no_offset():
     offset = DisparityOffset()
     assert (offset.offset_px, offset.step()) == (0.0, 0.0)
-    assert 0.3 < offset.sigma_px < 3.0
+    assert 0.1 < offset.sigma_px < 1.0
 
 
 def test_points_that_follow_the_camera_stay_where_it_sees_them():
