@@ -90,7 +90,7 @@ class DyObSlam:
         self._flow = DenseFlow(self.config.flow)
         self._objects = ObjectTracker(self.sensor, self.config.objects, self.config.tracking.seed)
         self._geometry = MultiViewGeometry(camera, self.config.geometry)
-        self._backend = BackEnd(self.sensor, self.config.backend, self.config.places)
+        self._backend = BackEnd(self.sensor, self.config.backend, self.places)
         self._anchors = FrameAnchors()
         self._landmarks: set[int] = set()
         self._lost_frames = 0
@@ -135,7 +135,7 @@ class DyObSlam:
         with self._stage("backend"):
             self._anchors.add(self.map, view.frame_index, tracked.T_world_camera)
             if is_keyframe:
-                self._backend.after_keyframe(self.map, prepared.features)
+                self._backend.after_keyframe(self.map, view.features)
         self._timings_ms["total"] = sum(self._timings_ms.values())
         result = self._result(prepared.frame, tracked, is_keyframe, estimates, objects)
         return replace(result, observations=seen)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.geometry import invert_T
 from pipelines.object_types import ObjectEstimates, ObjectState
 from pipelines.types import Array
 from viz import style
@@ -65,11 +66,22 @@ def object_paths(objects: ObjectEstimates) -> tuple[list[Polyline], list[Tag]]:
             continue
         color = style.object_color(int(object_id))
         breaks = np.flatnonzero(np.diff(own.timestamp_s) > OBJECT_GAP_S) + 1
-        pieces = [piece for piece in np.split(own.centers_m, breaks) if len(piece) > 1]
-        lines += [Polyline(piece, color, 2.6, "moving objects") for piece in pieces]
+        pieces = [own[rows] for rows in np.split(np.arange(len(own)), breaks) if len(rows) > 1]
+        lines += [Polyline(_path_of(piece), color, 2.6, "moving objects") for piece in pieces]
         speeds = KMH * own.speed_mps[-LAST_SPEEDS:]
         words = f"{object_id} {own.class_name[-1]}"
         if np.isfinite(speeds).any():
             words += f" {speed_words(float(np.nanmedian(speeds)))}"
         tags.append(Tag(own.centers_m[-1], words, color))
     return lines, tags
+
+
+def _path_of(rows: ObjectEstimates) -> Array:
+    """Where one point of an object's matter went, (N, 3): its centre as it is known in the end.
+
+    The centre of what is seen wanders through the object while more and more of it is seen.
+    """
+    Ts = rows.Ts_world_object
+    if not np.isfinite(Ts).all():
+        return rows.centers_m
+    return (Ts @ invert_T(Ts[-1]) @ np.append(rows.centers_m[-1], 1.0))[:, :3]

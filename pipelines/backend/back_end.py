@@ -22,9 +22,9 @@ from pipelines.backend.bundle_adjustment import BundleSolution, adjust_bundle, l
 from pipelines.backend.local_window import BundleWindow, local_window, to_correction
 from pipelines.backend.loop_detection import FEWEST_KEYFRAMES, LoopDetector
 from pipelines.backend.pose_graph import build_pose_graph, loop_correction, solve_pose_graph
-from pipelines.backend.vocabulary_files import load_vocabulary
+from pipelines.backend.seen_places import SeenPlaces
 from pipelines.backend.worker import InlineWorker, ProcessWorker, Worker
-from pipelines.config import BackendConfig, PlacesConfig
+from pipelines.config import BackendConfig
 from pipelines.frontend.sensor import Sensor
 from pipelines.geometry import invert_T, rotation_angle_deg
 from pipelines.mapping.correction import MapCorrection
@@ -61,14 +61,13 @@ class BackEnd:
         self,
         sensor: Sensor,
         config: BackendConfig,
-        places: PlacesConfig | None = None,
+        places: SeenPlaces,
         worker: Worker | None = None,
     ) -> None:
         self.sensor, self.config = sensor, config
-        self._places = places or PlacesConfig()
         self.worker = worker or (ProcessWorker() if config.process else InlineWorker())
         self._question: _Question | None = None
-        self._loops: LoopDetector | None = None
+        self._loops = LoopDetector(sensor, places)
         self._n_frames = 0
         self._warned = self._is_started = False
         self.n_applied = self.n_refused = self.n_loops = 0
@@ -114,9 +113,7 @@ class BackEnd:
 
     def _close_loop(self, sparse_map: SparseMap, features: Features) -> bool:
         """Ask for the pose graph where the latest keyframe closes a loop that is open."""
-        if self._loops is None:
-            self._loops = LoopDetector(self.sensor, load_vocabulary(self._places.vocabulary))
-        if len(sparse_map.keyframes) == FEWEST_KEYFRAMES:
+        if len(sparse_map.keyframes) >= FEWEST_KEYFRAMES:
             self._start_worker()
         loop = self._loops.take(sparse_map, features)
         if loop is None or not loop.is_open:

@@ -1,7 +1,7 @@
 """Loops: a keyframe that sees a place which was mapped long before, and where it is by that map.
 
 Owns which places are asked about, and the geometric proof. Corrects nothing: see `pose_graph`.
-Words and scores are in `vocabulary` and `place_database`.
+How keyframes look is known to `seen_places`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.backend.place_database import PlaceDatabase
-from pipelines.backend.vocabulary import Vocabulary
+from pipelines.backend.seen_places import SeenPlaces
 from pipelines.frontend.hypotheses import estimate_pnp, reprojection_inliers
 from pipelines.frontend.matching import match_all, match_in_radius
 from pipelines.frontend.motion_only_ba import estimate_camera_pose
@@ -81,15 +80,14 @@ class LoopClosure:
 
 
 class LoopDetector:
-    """Remembers all keyframes by their words, and proves that two are of one place."""
+    """Proves that two keyframes are of one place. places: all of the map, the latest one, too."""
 
-    def __init__(self, sensor: Sensor, vocabulary: Vocabulary) -> None:
-        self.sensor, self._vocabulary = sensor, vocabulary
-        self._places = PlaceDatabase(vocabulary.n_words)
+    def __init__(self, sensor: Sensor, places: SeenPlaces) -> None:
+        self.sensor, self._places = sensor, places
         self._unconfirmed: list[LoopClosure] = []
 
     def take(self, sparse_map: SparseMap, features: Features) -> LoopClosure | None:
-        """Ask about the latest keyframe, whose ORB features these are, and remember it.
+        """Ask about the latest keyframe, whose ORB features these are.
 
         A loop is told when a second keyframe, a few later at most, bears out the first.
         """
@@ -104,12 +102,9 @@ class LoopDetector:
         return None
 
     def _find(self, sparse_map: SparseMap, features: Features) -> LoopClosure | None:
-        """The loop that the latest keyframe alone would prove; the keyframe is remembered."""
+        """The loop that the latest keyframe alone would prove."""
         index = len(sparse_map.keyframes) - 1
-        bow = self._vocabulary.describe(self._vocabulary.words(features.descriptors))
-        near = self._near(sparse_map, index)
-        candidates = self._places.query(bow, exclude=near, n_best=_ASKED)
-        self._places.add(index, bow)
+        candidates = self._places.like_latest(self._near(sparse_map, index), _ASKED)
         score = dict(zip(candidates.keyframes.tolist(), candidates.scores.tolist(), strict=True))
         together = {
             k: s + sum(score.get(int(n), 0.0) for n in sparse_map.covisible_keyframes(k)[:2])

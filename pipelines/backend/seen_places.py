@@ -1,4 +1,4 @@
-"""The places that a map's keyframes have seen, as the tracker asks for them when it is lost.
+"""The places that a map's keyframes have seen: asked when the camera is lost, and for loops.
 
 Owns the vocabulary's loading, at the first keyframe and once a program, and which keyframe has
 which words. Whether a candidate is the same place is for geometry to say.
@@ -6,12 +6,13 @@ which words. Whether a candidate is the same place is for geometry to say.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import lru_cache
 
 import numpy as np
 
-from pipelines.backend.place_database import PlaceDatabase
-from pipelines.backend.vocabulary import Descriptors, Vocabulary
+from pipelines.backend.place_database import PlaceCandidates, PlaceDatabase
+from pipelines.backend.vocabulary import BowVector, Descriptors, Vocabulary
 from pipelines.backend.vocabulary_files import load_vocabulary
 from pipelines.config import PlacesConfig
 from pipelines.mapping.sparse_map import SparseMap
@@ -23,6 +24,7 @@ class SeenPlaces:
     def __init__(self, config: PlacesConfig) -> None:
         self.config = config
         self._database: PlaceDatabase | None = None
+        self._latest: BowVector | None = None
 
     def __len__(self) -> int:
         return 0 if self._database is None else len(self._database)
@@ -35,7 +37,8 @@ class SeenPlaces:
         vocabulary = self._vocabulary()
         if self._database is None:
             self._database = PlaceDatabase(vocabulary.n_words)
-        self._database.add(row, vocabulary.describe(vocabulary.words(descriptors)))
+        self._latest = vocabulary.describe(vocabulary.words(descriptors))
+        self._database.add(row, self._latest)
 
     def add_map(self, sparse_map: SparseMap) -> None:
         """Remember all keyframes of a map, by the points that they see and their free features."""
@@ -51,6 +54,15 @@ class SeenPlaces:
         bow = vocabulary.describe(vocabulary.words(descriptors))
         found = self._database.query(bow, n_best=self.config.relocalise_among)
         return [int(row) for row in found.keyframes]
+
+    def like_latest(self, exclude: Iterable[int], n_best: int) -> PlaceCandidates:
+        """The keyframes most like the one last added, the best first, but for some rows.
+
+        Raises ValueError before any was added.
+        """
+        if self._database is None or self._latest is None:
+            raise ValueError("SeenPlaces: expected a keyframe to ask about, found none added")
+        return self._database.query(self._latest, exclude, n_best=n_best)
 
     def _vocabulary(self) -> Vocabulary:
         return _load_once(self.config.vocabulary)

@@ -1,5 +1,6 @@
 """Paths of moving objects on maps: whose, where they break, and the tags at their ends."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ def make_objects(tracks: dict[int, np.ndarray], state: str = "moving") -> Object
     """Centres (N, 3) by id, a frame each 0.1 s; NaN where the object is not seen."""
     keys = [(j, k) for j, t in tracks.items() for k in range(len(t)) if np.isfinite(t[k]).all()]
     M, T = len(keys), np.tile(np.eye(4), (len(keys), 1, 1))
+    T[:, :3, 3] = np.reshape([tracks[j][k] for j, k in keys], (-1, 3))
     index, blank = np.array([k for _, k in keys]), np.full(M, np.nan)
     return ObjectEstimates(
         index, 0.1 * index, np.array([j for j, _ in keys]), np.full(M, "car"), np.ones(M),
@@ -52,6 +54,17 @@ def test_moving_objects_leave_paths_in_their_colors():
     np.testing.assert_allclose(tags[0].point_m, [0.0, 0.0, 29.0])
     assert object_paths(make_objects(tracks, "stopped")) == ([], [])
     assert object_paths(ObjectEstimates.empty()) == ([], [])
+
+
+def test_a_path_is_that_of_matter_and_not_of_what_is_seen_of_it():
+    objects = make_objects({1: line(30)})
+    grown = np.linspace(1.0, 0.0, 30)[:, None] * (0.5, 0.0, -1.5)  # from its rear to its middle
+    objects = replace(objects, centers_m=objects.centers_m + grown)
+    (path,), _ = object_paths(objects)
+    np.testing.assert_allclose(path.points_m, line(30), atol=1e-9)
+    unknown = replace(objects, Ts_world_object=np.full((30, 4, 4), np.nan))
+    (path,), _ = object_paths(unknown)
+    np.testing.assert_allclose(path.points_m, objects.centers_m)
 
 
 def test_the_camera_path_lies_over_those_of_objects():

@@ -14,8 +14,9 @@ import pytest
 from pipelines.backend.back_end import BackEnd, reason_to_refuse
 from pipelines.backend.bundle_adjustment import BundleSolution, adjust_bundle, load_solver
 from pipelines.backend.local_window import local_window, to_correction, whole_map
+from pipelines.backend.seen_places import SeenPlaces
 from pipelines.backend.worker import WorkerDied
-from pipelines.config import BackendConfig, load_config
+from pipelines.config import BackendConfig, PlacesConfig, load_config
 from pipelines.dyob_slam import DyObSlam
 from pipelines.geometry import exp_se3
 from pipelines.io.result import load_result
@@ -26,6 +27,7 @@ from pipelines.types import Features, TrackingStatus
 SETTINGS = ("backend.local_adjustment=true", "mapping.keyframe_max_interval=2")
 
 ADJUSTING = BackendConfig(local_adjustment=True, loop_closing=False)
+PLACES = SeenPlaces(PlacesConfig())  # of which nobody asks
 
 
 class Slow:
@@ -172,9 +174,7 @@ def test_an_answer_is_applied_at_its_frame_however_soon_it_is_there(mapped) -> N
     sparse_map, sensor = mapped
     for quick in (True, False):
         worker = Slow()
-        back_end = BackEnd(
-            sensor, BackendConfig(local_adjustment=True, loop_closing=False), worker=worker
-        )
+        back_end = BackEnd(sensor, ADJUSTING, PLACES, worker)
         assert back_end.take() is None
         back_end.after_keyframe(sparse_map, Features.empty())
         back_end.after_keyframe(sparse_map, Features.empty())  # one at a time
@@ -196,7 +196,7 @@ def test_without_waiting_an_answer_is_taken_when_it_comes(mapped) -> None:
     sparse_map, sensor = mapped
     worker = Slow()
     config = BackendConfig(local_adjustment=True, loop_closing=False, wait=False)
-    back_end = BackEnd(sensor, config, worker=worker)
+    back_end = BackEnd(sensor, config, PLACES, worker)
     back_end.after_keyframe(sparse_map, Features.empty())
     for _ in range(30):
         assert back_end.take() is None
@@ -208,9 +208,7 @@ def test_without_waiting_an_answer_is_taken_when_it_comes(mapped) -> None:
 def test_an_answer_that_never_comes_is_dropped_with_one_warning(mapped, caplog, error) -> None:
     sparse_map, sensor = mapped
     worker = Slow()
-    back_end = BackEnd(
-        sensor, BackendConfig(local_adjustment=True, loop_closing=False), worker=worker
-    )
+    back_end = BackEnd(sensor, ADJUSTING, PLACES, worker)
     with caplog.at_level(logging.WARNING, logger="dyob.backend"):
         for n in range(2):
             back_end.after_keyframe(sparse_map, Features.empty())
@@ -277,9 +275,7 @@ def test_bad_solutions_are_refused_with_their_reason(solved) -> None:
 def test_a_refused_answer_leaves_the_map_alone(mapped, solved, caplog) -> None:
     _, good = solved
     worker = Slow()
-    back_end = BackEnd(
-        mapped[1], BackendConfig(local_adjustment=True, loop_closing=False), worker=worker
-    )
+    back_end = BackEnd(mapped[1], ADJUSTING, PLACES, worker)
     back_end.after_keyframe(mapped[0], Features.empty())
     worker.questions[-1][0].set_result(replace(good, error_after=good.error_before))
     with caplog.at_level(logging.INFO, logger="dyob.backend"):

@@ -9,7 +9,6 @@ import pytest
 
 from pipelines.backend import loop_detection
 from pipelines.backend.loop_detection import LoopDetector
-from pipelines.backend.vocabulary_files import load_vocabulary
 from pipelines.datasets.simulated.sequence import SimulatedSequence
 from pipelines.dyob_slam import DyObSlam
 from pipelines.geometry import exp_se3, rotation_angle_deg
@@ -25,7 +24,7 @@ def mapped():
     """A map of some frames, the detector that has seen them, and their features."""
     sequence = SimulatedSequence("static", frames=12, scale=0.5)
     slam = DyObSlam(sequence.camera)
-    detector = LoopDetector(slam.sensor, load_vocabulary())
+    detector = LoopDetector(slam.sensor, slam.places)
     features = []
     for index in range(12):
         prepared = slam.prepare(sequence.read(index))
@@ -35,11 +34,12 @@ def mapped():
     return sequence, slam, detector, features
 
 
-def come_again(slam: DyObSlam, T: np.ndarray) -> None:
+def come_again(slam: DyObSlam, T: np.ndarray, descriptors: np.ndarray) -> None:
     """A keyframe that tracking led to a drifted pose, where it knew no point."""
     last = slam.map.keyframes[-1]
     index, stamp = last.frame_index + 1, last.timestamp_s + 0.1
     slam.map.add_keyframe(Keyframe(index, stamp, T, Tracks.empty(), Features.empty()))
+    slam.places.add(len(slam.map.keyframes) - 1, descriptors)
 
 
 def test_a_place_seen_again_is_found_where_it_is(mapped, monkeypatch) -> None:
@@ -47,9 +47,9 @@ def test_a_place_seen_again_is_found_where_it_is(mapped, monkeypatch) -> None:
     monkeypatch.setattr(loop_detection, "_RECENT", 1)
     truth = sequence.ground_truth().Ts_world_camera
     truth = np.linalg.inv(truth[0]) @ truth
-    come_again(slam, DRIFT @ truth[1])
+    come_again(slam, DRIFT @ truth[1], features[1].descriptors)
     assert detector.take(slam.map, features[1]) is None  # one alone is no proof
-    come_again(slam, DRIFT @ truth[2])
+    come_again(slam, DRIFT @ truth[2], features[2].descriptors)
     closure = detector.take(slam.map, features[2])
     assert closure is not None
     assert slam.map.keyframes[closure.place].frame_index < 12
@@ -66,9 +66,9 @@ def test_places_that_disagree_are_no_loop(mapped, monkeypatch) -> None:
     truth = sequence.ground_truth().Ts_world_camera
     truth = np.linalg.inv(truth[0]) @ truth
     aside = exp_se3(np.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0]))
-    come_again(slam, DRIFT @ truth[3])
+    come_again(slam, DRIFT @ truth[3], features[3].descriptors)
     assert detector.take(slam.map, features[3]) is None
-    come_again(slam, aside @ truth[4])
+    come_again(slam, aside @ truth[4], features[4].descriptors)
     assert detector.take(slam.map, features[4]) is None
 
 
@@ -78,5 +78,5 @@ def test_what_was_never_seen_is_no_loop(mapped, monkeypatch) -> None:
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 256, features[1].descriptors.shape, dtype=np.uint8)
     for _ in range(2):
-        come_again(slam, np.eye(4))
+        come_again(slam, np.eye(4), noise)
         assert detector.take(slam.map, replace(features[1], descriptors=noise)) is None

@@ -49,3 +49,14 @@ def test_a_vocabulary_that_is_not_there_is_one_sentence():
     places = SeenPlaces(PlacesConfig(vocabulary="no/such_words.npz"))
     with pytest.raises(FormatError, match=r"no/such_words\.npz"):
         places.add(0, images(1, np.random.default_rng(3))[0])
+
+
+def test_the_latest_is_compared_with_all_but_some() -> None:
+    places = SeenPlaces(PlacesConfig())
+    with pytest.raises(ValueError, match="none added"):
+        places.like_latest([], 1)
+    seen = images(3, np.random.default_rng(4))
+    for row, descriptors in enumerate([*seen, seen[1]]):
+        places.add(row, descriptors)
+    assert places.like_latest([3], 1).keyframes.tolist() == [1]
+    assert 1 not in places.like_latest([1, 3], 4).keyframes
