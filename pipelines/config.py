@@ -269,8 +269,8 @@ class BackendConfig:
     """Step 11: local bundle adjustment of the latest keyframes, and loops, beside tracking."""
 
     loop_closing: bool = True  # places seen before correct the drift since then
-    # off: points are refined at every frame as it is, and what this adds is small. Measured: steps
-    # of a real stereo drive err 4 % less, its whole path more; elsewhere no clear gain
+    # off: points are refined at every frame as it is. Measured: on sequences of some 100 frames no
+    # clear gain, and a real stereo drive of 60 m gets longer; two rounds of a block err a third less
     local_adjustment: bool = False
     process: bool = True  # in a process of its own; false: in this one, with the same answers
     # an answer is due a fixed number of frames after its question, and waited for, so that runs

@@ -1,6 +1,6 @@
 """Which keyframes and points are adjusted together, and how the answer returns to the map.
 
-Owns the choice of the local window and of the whole map, as problems for `bundle_adjustment`.
+Owns the choice of the local window, as a problem for `bundle_adjustment`.
 Changes nothing: what it returns are copies.
 """
 
@@ -55,15 +55,6 @@ def local_window(
     if len(free) == 0:
         return None
     return _window(sparse_map, sensor, held, free, seen & sparse_map.alive)
-
-
-def whole_map(sparse_map: SparseMap, sensor: Sensor) -> BundleWindow | None:
-    """All keyframes but the first, which is held, and all points; for full bundle adjustment."""
-    n = len(sparse_map.keyframes)
-    if n < 2:
-        return None
-    rows = np.arange(n)
-    return _window(sparse_map, sensor, rows[:1], rows[1:], sparse_map.alive)
 
 
 def _covisible_with(sparse_map: SparseMap, keyframes: Ids) -> Ids:

@@ -119,29 +119,22 @@ class Vocabulary:
         return depth
 
     def words(self, descriptors: Descriptors) -> Indices:
-        """Word (N,) int64 of each descriptor (N, 32) uint8."""
-        return self.words_and_nodes(descriptors, 0)[0]
+        """Word (N,) int64 of each descriptor (N, 32) uint8.
 
-    def words_and_nodes(self, descriptors: Descriptors, level: int) -> tuple[Indices, Indices]:
-        """Word (N,) int64 of each descriptor (N, 32) uint8, and the node passed at a level.
-
-        level: 0 is the root, 1 its children. Where the way ended before, the node is the leaf.
         A descriptor goes to the nearest child by Hamming distance; the first wins a tie.
         """
         check_shape("Vocabulary", "descriptors", descriptors, (None, 32))
-        leaves, nodes = np.empty((2, len(descriptors)), np.int64)
+        leaves = np.empty(len(descriptors), np.int64)
         bits = np.ascontiguousarray(descriptors).view(np.uint64)
         for start in range(0, len(descriptors), _CHUNK):
             chunk = slice(start, start + _CHUNK)
-            leaves[chunk], nodes[chunk] = self._descend(bits[chunk], level)
-        return self._word_of_node[leaves], nodes
+            leaves[chunk] = self._descend(bits[chunk])
+        return self._word_of_node[leaves]
 
-    def _descend(self, bits: NDArray[np.uint64], level: int) -> tuple[Indices, Indices]:
-        """Leaves (N,) of descriptors as (N, 4) uint64, and the nodes passed at `level`."""
+    def _descend(self, bits: NDArray[np.uint64]) -> Indices:
+        """Leaves (N,) of descriptors as (N, 4) uint64."""
         node = np.zeros(len(bits), np.int64)
-        passed = node.copy()
         going = np.arange(len(bits))
-        depth = 0
         while len(going):
             inner = self._inner_of_node[node[going]]
             distance = reduce(
@@ -154,11 +147,8 @@ class Vocabulary:
             if self._missing_bits is not None:
                 distance += self._missing_bits[inner]
             node[going] = self._first_child[node[going]] + distance.argmin(1)
-            depth += 1
-            if depth == level:
-                passed = node.copy()
             going = going[self.n_children[node[going]] > 0]
-        return node, node if level > depth else passed
+        return node
 
     def describe(self, words: Indices) -> BowVector:
         """The bag of an image's words (N,): term frequency times idf, which add up to one.

@@ -13,7 +13,7 @@ import pytest
 
 from pipelines.backend.back_end import BackEnd, reason_to_refuse
 from pipelines.backend.bundle_adjustment import BundleSolution, adjust_bundle, load_solver
-from pipelines.backend.local_window import local_window, to_correction, whole_map
+from pipelines.backend.local_window import local_window, to_correction
 from pipelines.backend.seen_places import SeenPlaces
 from pipelines.backend.worker import WorkerDied
 from pipelines.config import BackendConfig, PlacesConfig, load_config
@@ -223,7 +223,6 @@ def test_the_window_is_copied_and_holds_the_first_keyframe(mapped) -> None:
     for window in (
         local_window(sparse_map, sensor, BackendConfig(local_keyframes=3)),
         local_window(sparse_map, sensor, BackendConfig(local_keyframes=99)),
-        whole_map(sparse_map, sensor),
     ):
         problem = window.problem
         assert not problem.held[-1] and problem.held.any()

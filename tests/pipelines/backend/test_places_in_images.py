@@ -12,7 +12,6 @@ from pipelines.backend.place_database import PlaceCandidates, PlaceDatabase
 from pipelines.backend.training_images import images_of, paint_leaves
 from pipelines.backend.vocabulary import Vocabulary
 from pipelines.backend.vocabulary_files import load_vocabulary
-from pipelines.backend.word_matching import match_by_words
 from pipelines.config import OrbConfig
 from pipelines.datasets import open_sequence
 from pipelines.datasets.sequence import Sequence
@@ -102,19 +101,6 @@ def test_the_loop_of_a_real_kitchen_is_found(real_data, vocabulary, orb) -> None
         inside = PlaceCandidates(found.keyframes[of_kitchen], found.scores[of_kitchen])
         assert found.scores[0] > 1.2 * best_of(inside, is_other)
         assert found.scores[0] > 1.2 * found.scores[~of_kitchen].max()
-
-
-def test_real_images_of_one_place_match_by_words(real_data, vocabulary, orb) -> None:
-    """Most matches obey one homography or epipolar geometry: here a fundamental matrix."""
-    kitchen = open_sequence(real_data("7scenes_redkitchen_200f"))
-    a, b = (features_of(orb, kitchen.read(k).image) for k in (50, 192))
-    (_, nodes_a), (_, nodes_b) = (vocabulary.words_and_nodes(f.descriptors, 1) for f in (a, b))
-    in_a, in_b = match_by_words(a, b, nodes_a, nodes_b)
-    assert len(in_a) == len(set(in_b.tolist())) > 100
-    _, inlier = cv2.findFundamentalMat(
-        a.uv_px[in_a], b.uv_px[in_b], cv2.USAC_MAGSAC, 2.0, 0.999, 5000
-    )
-    assert 50 < inlier.sum() < len(in_a)
 
 
 def test_images_come_from_files_folders_and_sequences(vdo_folder, tmp_path) -> None:

@@ -52,10 +52,6 @@ def test_words_are_those_of_a_descent_by_hand(n_children: list[int]) -> None:
     expected = [leaves.index(path[-1]) for path in paths]
     assert vocabulary.words(descriptors).tolist() == expected
     assert set(expected) == set(range(vocabulary.n_words))
-    for level in range(5):
-        words, nodes = vocabulary.words_and_nodes(descriptors, level)
-        assert words.tolist() == expected
-        assert nodes.tolist() == [path[min(level, len(path) - 1)] for path in paths]
 
 
 def test_many_descriptors_get_the_words_that_each_gets_alone() -> None:
