@@ -270,7 +270,8 @@ class BackendConfig:
 
     loop_closing: bool = True  # places seen before correct the drift since then
     # off: points are refined at every frame as it is. Measured: on sequences of some 100 frames no
-    # clear gain, and a real stereo drive of 60 m gets longer; two rounds of a block err a third less
+    # clear gain, and a real stereo drive of 60 m gets longer; two rounds of a block err a third
+    # less, and half as much where the loop is closed as well
     local_adjustment: bool = False
     process: bool = True  # in a process of its own; false: in this one, with the same answers
     # an answer is due a fixed number of frames after its question, and waited for, so that runs
