@@ -17,10 +17,18 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from app import installation, system_libraries
-from app.environment import CORE, DEVELOPMENT, TORCH, Environment, SetupError, has_packages
+from app.environment import (
+    CORE,
+    DEVELOPMENT,
+    NOTEBOOK,
+    TORCH,
+    Environment,
+    SetupError,
+    has_packages,
+)
 from app.installation import Say
 
-_NEEDED_GB = {CORE: 2.5, DEVELOPMENT: 0.5, TORCH: 10.0}
+_NEEDED_GB = {CORE: 2.5, DEVELOPMENT: 0.7, NOTEBOOK: 0.5, TORCH: 10.0}
 
 
 def prepare(argv: Sequence[str], sections: Sequence[str] = (CORE,)) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from importlib import import_module
 
 from app import bootstrap
-from app.environment import CORE, DEVELOPMENT, TORCH
+from app.environment import CORE, DEVELOPMENT, NOTEBOOK, TORCH
 
 PROGRAM = "python3 -m app"
 LATEST = "results/latest"
@@ -114,7 +114,7 @@ models train-vocabulary IMAGES simulated:room --output my_words.npz""",
         """\
 test                            # everything
 test -k config -x               # pytest's flags""",
-        (CORE, DEVELOPMENT, TORCH),
+        (CORE, DEVELOPMENT, NOTEBOOK, TORCH),
     ),
 }
 

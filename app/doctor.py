@@ -18,7 +18,7 @@ from typing import Any
 
 from app import system_libraries
 from app.bootstrap import has_venv_module
-from app.environment import CORE, DEVELOPMENT, TORCH, Environment, missing_packages
+from app.environment import CORE, DEVELOPMENT, NOTEBOOK, TORCH, Environment, missing_packages
 
 
 class Verdict(Enum):
@@ -95,7 +95,7 @@ def _memory_gb() -> float:
 
 def _packages(environment: Environment) -> Iterator[Finding]:
     set_up_is_off = os.environ.get("DYOB_NO_SETUP") == "1"
-    for section in (CORE, DEVELOPMENT, TORCH):
+    for section in (CORE, DEVELOPMENT, NOTEBOOK, TORCH):
         pins = environment.pins([section])
         missing = missing_packages(pins)
         if not missing:

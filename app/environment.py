@@ -22,7 +22,7 @@ from pathlib import Path
 from pipelines.errors import DyObError
 
 ROOT = Path(__file__).resolve().parent.parent
-CORE, DEVELOPMENT, TORCH = "core", "development", "torch"
+CORE, DEVELOPMENT, NOTEBOOK, TORCH = "core", "development", "notebook", "torch"
 
 
 class SetupError(DyObError):

@@ -20,6 +20,7 @@ REQUIRED = {  # without these `import open3d` fails
 }
 VULKAN_LOADER = ("libvulkan.so.1", "libvulkan1")
 VULKAN_DRIVERS = "mesa-vulkan-drivers"
+BROWSER = "chromium"  # that the tests open the pages in; a program and a package of one name
 _DRIVER_FOLDERS = (
     "/usr/local/etc/vulkan/icd.d",
     "/usr/local/share/vulkan/icd.d",
@@ -57,6 +58,11 @@ def vulkan_drivers() -> list[Path]:
     if named:
         return [Path(file) for file in named.split(os.pathsep) if Path(file).is_file()]
     return [file for folder in _DRIVER_FOLDERS for file in sorted(Path(folder).glob("*.json"))]
+
+
+def browser() -> str | None:
+    """Path of the browser that the tests drive, or None."""
+    return shutil.which(BROWSER)
 
 
 def can_install() -> bool:

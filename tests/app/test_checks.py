@@ -7,7 +7,7 @@ from argparse import Namespace
 
 import pytest
 
-from app import checks
+from app import checks, system_libraries
 
 
 @pytest.fixture
@@ -21,6 +21,7 @@ def commands(monkeypatch):
         return subprocess.CompletedProcess(command, int(command[2] in failing))
 
     monkeypatch.setattr(subprocess, "run", run)
+    monkeypatch.setattr(system_libraries, "browser", lambda: "/usr/bin/chromium")
     return seen, failing
 
 
@@ -42,3 +43,25 @@ def test_one_failure_fails_the_whole_and_stops_nothing(commands, capsys, module)
     closing = capsys.readouterr().out.splitlines()[-1]
     assert closing.startswith("dyob-slam: FAILED: ")
     assert module in closing
+
+
+def test_the_browser_is_installed_where_it_is_missing(commands, monkeypatch, capsys) -> None:
+    installed: list[str] = []
+    monkeypatch.delenv("DYOB_NO_SETUP", raising=False)
+    monkeypatch.setattr(system_libraries, "browser", lambda: "found" if installed else None)
+    monkeypatch.setattr(system_libraries, "can_install", lambda: True)
+    monkeypatch.setattr(system_libraries, "install", lambda names, log: installed.extend(names))
+    assert checks.test(Namespace(pytest_arguments=[])) == 0
+    assert installed == ["chromium"]
+    assert "are skipped" not in capsys.readouterr().out
+
+
+def test_without_a_browser_and_the_right_to_install_one_a_command_is_told(
+    commands, monkeypatch, capsys
+) -> None:
+    monkeypatch.delenv("DYOB_NO_SETUP", raising=False)
+    monkeypatch.setattr(system_libraries, "browser", lambda: None)
+    monkeypatch.setattr(system_libraries, "can_install", lambda: False)
+    assert checks.test(Namespace(pytest_arguments=[])) == 0
+    line = next(x for x in capsys.readouterr().out.splitlines() if "are skipped" in x)
+    assert "apt-get install -y --no-install-recommends chromium" in line

@@ -10,6 +10,7 @@ import pytest
 from app.environment import (
     CORE,
     DEVELOPMENT,
+    NOTEBOOK,
     TORCH,
     Environment,
     SetupError,
@@ -44,7 +45,7 @@ def test_what_is_no_pin_is_refused_with_its_line(line: str) -> None:
 
 def test_the_projects_own_file_pins_every_section(repository: Path) -> None:
     sections = Environment.read(repository).sections
-    assert list(sections) == [CORE, DEVELOPMENT, TORCH]
+    assert list(sections) == [CORE, DEVELOPMENT, NOTEBOOK, TORCH]
     for pins in sections.values():
         assert len(pins) == len(set(pins))
     # A package that two sections need is pinned to one version.
