@@ -305,8 +305,8 @@ class BatchConfig:
     held_out_share: float = 0.1  # of the sightings, which judge whether the batch is believed
     max_static_per_frame: int = 0  # static points of a frame, the longest tracks first, 0 = all
     covariances: bool = True  # standard deviations of the final poses
-    # partial: cameras and static points alone, in windows
-    method: Literal["global", "partial"] = "global"
+    # partial: cameras and static points alone, in windows. point_motion: VDO-SLAM's formulation
+    method: Literal["global", "partial", "point_motion"] = "global"
     partial_window: int = 20  # frames of a window of the partial batch (paper)
     partial_overlap: int = 4  # frames that a window shares with the one before (paper)
 

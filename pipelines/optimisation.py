@@ -24,6 +24,7 @@ from pipelines.backend.batch_outcome import (
 )
 from pipelines.backend.global_batch import BatchResult, run_global_batch
 from pipelines.backend.partial_batch import run_partial_batch
+from pipelines.backend.point_motion_batch import run_point_motion_batch
 from pipelines.config import BatchConfig
 from pipelines.errors import DyObError, FormatError
 from pipelines.evaluation import evaluate_result
@@ -75,6 +76,8 @@ def optimise_result(
     camera = read_camera(folder / names.OBSERVATIONS)
     if config.method == "partial":
         result = run_partial_batch(camera, start.log, config, progress)
+    elif config.method == "point_motion":
+        result = run_point_motion_batch(camera, start.log, start.objects, config, progress)
     else:
         result = run_global_batch(camera, start.log, start.objects, config, progress)
     if result is None or not result.accepted:

@@ -9,6 +9,7 @@ from pipelines.backend import global_batch
 from pipelines.backend.batch_outcome import corrections, objects_after, trajectory_after
 from pipelines.backend.global_batch import run_global_batch
 from pipelines.backend.partial_batch import run_partial_batch
+from pipelines.backend.point_motion_batch import run_point_motion_batch
 from pipelines.config import BatchConfig
 from pipelines.frame_observations import FrameObservations
 from pipelines.geometry import exp_se3, invert_T, rotation_vector
@@ -108,6 +109,27 @@ def test_the_partial_batch_improves_and_joins_its_windows(make_drive, stereo):
     joints = [i for i in range(len(steps)) if (i - 7) % 5 == 0 and i >= 7]
     others = np.delete(steps, joints)
     assert steps[joints].max() < 3.0 * others.max()
+
+
+def test_a_point_a_sighting_and_a_motion_a_frame_come_to_nearly_the_same(make_drive, stereo):
+    """VDO-SLAM's formulation against ours: both far better than the start, neither than truth."""
+    drive = make_drive(1)
+    config = replace(CONFIG, max_steps=15)
+    B_true = invert_T(drive.Ls_true[:-1]) @ drive.Ls_true[1:]
+    rms_m = {}
+    for run in (run_point_motion_batch, run_global_batch):
+        result = run(stereo, drive.log, drive.objects, config)
+        assert result.accepted and result.accepted_objects == {1}
+        for name, problem in (("before", result.before), (run.__name__, result.after)):
+            Ls = problem.Ts_world_object
+            H = Ls[1:] @ invert_T(Ls[:-1])
+            B = invert_T(drive.Ls_true[:-1]) @ H @ drive.Ls_true[:-1]
+            off = perturbations(problem.Ts_world_camera, drive.Ts_true), perturbations(B, B_true)
+            rms_m[name] = [float(np.sqrt(np.mean(e[:, 3:] ** 2))) for e in off]
+    theirs, ours = rms_m["run_point_motion_batch"], rms_m["run_global_batch"]
+    for k in range(2):
+        assert 0.0 < theirs[k] < 0.1 * rms_m["before"][k]
+        assert 0.5 * ours[k] < theirs[k] < 2.0 * ours[k]
 
 
 def test_lost_frames_follow_and_too_little_is_left_alone(make_drive, stereo):
