@@ -303,6 +303,7 @@ class BatchConfig:
     turn_radps2: float = 0.2  # rad/s^2, and of the change of a turn
     planar_sigma: float = 0.0  # tilt and lift of road vehicles as a share of their way, 0 = free
     held_out_share: float = 0.1  # of the sightings, which judge whether the batch is believed
+    guard: bool = True  # refuse what these show to be worse; false: for comparisons
     max_static_per_frame: int = 0  # static points of a frame, the longest tracks first, 0 = all
     covariances: bool = True  # standard deviations of the final poses
     # partial: cameras and static points alone, in windows. point_motion: VDO-SLAM's formulation

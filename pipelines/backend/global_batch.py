@@ -104,7 +104,7 @@ def run_global_batch(
             keep_uv, keep_disparity = inliers(solution.residuals)
         done = (number + 1) * config.max_steps
     assert solution is not None
-    verdicts = judge(problem, solution.problem, held)
+    verdicts = judge(problem, solution.problem, held, config.guard)
     step()
     covariances = None
     if config.covariances and verdicts[CAMERA].accepted:

@@ -25,7 +25,7 @@ class Verdict:
 
     object_id: 0 for the static world, by which the cameras are judged. n_held_out: sightings behind
     it; without any there is nothing to object to. worse_by: mean growth of their squared errors,
-    in that mean's own standard deviations.
+    in that mean's own standard deviations. is_binding: whether the batch is refused by it.
     """
 
     object_id: int
@@ -33,16 +33,21 @@ class Verdict:
     before: float
     after: float
     worse_by: float
+    is_binding: bool = True
 
     @property
     def accepted(self) -> bool:
-        """Whether the batch made it no worse."""
-        return self.n_held_out == 0 or (
-            self.after <= _TOLERANCE * self.before or self.worse_by < _SIGNIFICANT
+        """Whether the batch made it no worse, or nobody minds."""
+        return (
+            not self.is_binding
+            or self.n_held_out == 0
+            or (self.after <= _TOLERANCE * self.before or self.worse_by < _SIGNIFICANT)
         )
 
 
-def judge(before: BatchProblem, after: BatchProblem, held: HeldOut) -> tuple[Verdict, ...]:
+def judge(
+    before: BatchProblem, after: BatchProblem, held: HeldOut, is_binding: bool = True
+) -> tuple[Verdict, ...]:
     """Verdicts on the static world and on each object, all its stretches together.
 
     before, after: the same problem at the front-end's answer and at the batch's. Points settle for
@@ -56,13 +61,13 @@ def judge(before: BatchProblem, after: BatchProblem, held: HeldOut) -> tuple[Ver
         own = owner == object_id
         n = int(own.sum())
         if n == 0:
-            verdicts.append(Verdict(int(object_id), 0, np.nan, np.nan, np.nan))
+            verdicts.append(Verdict(int(object_id), 0, np.nan, np.nan, np.nan, is_binding))
             continue
         sizes = [float(np.sqrt(e[own].mean())) for e in errors]
         growth = errors[1][own] - errors[0][own]
         chance = float(growth.std() / np.sqrt(n))
         worse_by = float(growth.mean()) / max(chance, 1e-12)
-        verdicts.append(Verdict(int(object_id), n, sizes[0], sizes[1], worse_by))
+        verdicts.append(Verdict(int(object_id), n, sizes[0], sizes[1], worse_by, is_binding))
     return tuple(verdicts)
 
 

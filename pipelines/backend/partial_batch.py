@@ -53,7 +53,8 @@ def run_partial_batch(
         costs += cost
         n_outliers += left_out
         progress(number + 1, len(windows))
-    return as_result(before, problem, judge(before, problem, held), None, costs, n_outliers)
+    verdicts = judge(before, problem, held, config.guard)
+    return as_result(before, problem, verdicts, None, costs, n_outliers)
 
 
 def _windows(n_frames: int, size: int, overlap: int) -> list[tuple[int, int]]:

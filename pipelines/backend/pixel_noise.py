@@ -6,6 +6,7 @@ Owns the noise models, shared by observations of nearly equal sigmas, and Huber'
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -44,14 +45,10 @@ class PixelNoise:
             model = self._model(step_uv, step_d if is_stereo else None)
             if is_stereo:
                 seen = gtsam.StereoPoint2(left_px, right_px, v_px)
-                yield lambda X, p, seen=seen, model=model: gtsam.GenericStereoFactor3D(
-                    seen, model, X, p, self._stereo
-                )
+                yield partial(_stereo_factor, seen, model, self._stereo)
             else:
                 pixel = gtsam.Point2(left_px, v_px)
-                yield lambda X, p, pixel=pixel, model=model: gtsam.GenericProjectionFactorCal3_S2(
-                    pixel, model, X, p, self._mono
-                )
+                yield partial(_projection_factor, pixel, model, self._mono)
 
     def _model(self, step_uv: int, step_d: int | None) -> Any:
         if (step_uv, step_d) not in self._models:
@@ -72,6 +69,18 @@ def huber_noise(sigma_uv_px: float, sigma_disparity_px: float | None) -> Any:
         covariance = np.array([[uv, uv, 0.0], [uv, uv + d, 0.0], [0.0, 0.0, uv]])
         gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER), gaussian)
+
+
+def _stereo_factor(seen: Any, model: Any, K: Any, X: int, p: int) -> Any:
+    import gtsam
+
+    return gtsam.GenericStereoFactor3D(seen, model, X, p, K)
+
+
+def _projection_factor(pixel: Any, model: Any, K: Any, X: int, p: int) -> Any:
+    import gtsam
+
+    return gtsam.GenericProjectionFactorCal3_S2(pixel, model, X, p, K)
 
 
 def _steps(sigmas_px: Array) -> Any:

@@ -69,7 +69,8 @@ def run_point_motion_batch(
             break
     solved = _read(problem, optimizer.values())
     ends = np.array([costs[0], costs[-1]])
-    return as_result(problem, solved, judge(problem, solved, held), None, ends, 0)
+    verdicts = judge(problem, solved, held, config.guard)
+    return as_result(problem, solved, verdicts, None, ends, 0)
 
 
 def _point_key(row: int) -> int:

@@ -84,6 +84,8 @@ def test_what_gets_worse_is_refused(make_drive, stereo, monkeypatch, what):
     result = run_global_batch(stereo, drive.log, drive.objects, CONFIG)
     assert result.accepted == (what == "objects")
     assert not result.accepted_objects
+    unguarded = run_global_batch(stereo, drive.log, drive.objects, replace(CONFIG, guard=False))
+    assert unguarded.accepted and unguarded.accepted_objects == {1}
     kept = result.before.Ts_world_object
     np.testing.assert_array_equal(result.after.Ts_world_object, kept)
     same = np.array_equal(result.after.Ts_world_camera, result.before.Ts_world_camera)
