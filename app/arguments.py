@@ -29,6 +29,13 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", type=_positive, metavar="N", help="stop after N frames")
     parser.add_argument("--stride", type=_positive, default=1, metavar="S", help="every S-th frame")
     parser.add_argument("--seed", type=_not_negative, metavar="N", help="of all random choices")
+    _add_simulation(parser)
+    _add_maps(parser)
+    _add_settings(parser)
+    _add_output(parser)
+
+
+def _add_simulation(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--degrade",
         nargs="?",
@@ -42,9 +49,6 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         help="simulated sequences: which inputs come, of depth,flow,masks,right; 'right' alone is "
         "a stereo camera and nothing else (default: depth,flow,masks)",
     )
-    _add_maps(parser)
-    _add_settings(parser)
-    _add_output(parser)
 
 
 def _add_maps(parser: argparse.ArgumentParser) -> None:
@@ -122,6 +126,27 @@ def _add_prepare(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar and no table")
     _add_settings(parser)
+
+
+def _add_bench(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "paths",
+        metavar="PATH",
+        nargs="*",
+        help="data folders and simulated:NAME (default: some simulated ones, rendered at first "
+        "use)",
+    )
+    parser.add_argument(
+        "--runs", type=_positive, default=1, metavar="N", help="of each, with the seeds 0 to N-1"
+    )
+    parser.add_argument("--frames", type=_positive, metavar="N", help="the first N frames of each")
+    parser.add_argument("--dataset", metavar="NAME", help="layout, where the guess is wrong")
+    _add_simulation(parser)
+    _add_settings(parser)
+    parser.add_argument(
+        "--output", metavar="DIR", help="folder to fill (default: a new one in results/)"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress and no tables")
 
 
 def _add_doctor(parser: argparse.ArgumentParser) -> None:
@@ -228,6 +253,7 @@ ADDERS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     "eval": _add_result,
     "optimize": _add_optimize,
     "render": _add_render,
+    "bench": _add_bench,
     "prepare": _add_prepare,
     "doctor": _add_doctor,
     "config": _add_settings,

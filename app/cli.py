@@ -68,6 +68,15 @@ optimize RESULT --set batch.method=partial""",
 render                          # the latest result
 render RESULT --size 1920x1080 --views top""",
     ),
+    "bench": Verb(
+        "app.bench:bench",
+        "run sequences, compare times and errors, with published figures beside ours",
+        """\
+bench                           # some simulated sequences: nothing to download
+bench --runs 5                  # the paper's table of errors and chart of speed errors
+bench DATA simulated:crossing --frames 100
+bench simulated:kitti_0003 --degrade --set flow.preset=fast""",
+    ),
     "prepare": Verb(
         "app.preparation:prepare",
         "write depth, flow and masks of a sequence, so that later runs reuse them",
