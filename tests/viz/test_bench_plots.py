@@ -10,7 +10,7 @@ import pytest
 
 from pipelines.errors import DyObError, FormatError
 from viz import style
-from viz.bench_plots import bench_figure_of, plot_bench, possible_bench_plots
+from viz.bench_plots import PALE, bench_figure_of, plot_bench, possible_bench_plots
 
 WIDTH_PX = 1350
 
@@ -51,7 +51,7 @@ def test_both_figures_are_written_and_not_blank(content, tmp_path) -> None:
     assert min(table.shape[0], bars.shape[0]) > 300
     dark = (table.max(2) < 120).sum()
     assert 2000 < dark < 0.2 * table[..., 0].size  # print on paper
-    for color in (style.ESTIMATE, style.END, style.TRUTH):
+    for color in (style.ESTIMATE, PALE, style.TRUTH):
         assert (np.abs(bars - color).sum(2) < 30).sum() > 500
 
 
