@@ -25,6 +25,8 @@ from viz import object_plots, style
 from viz.figures import metric_unit, new_figure, save_figure, whole_ticks
 from viz.style import hex_color as _hex
 
+STILL_M = 0.05  # to either side is shown at the least
+FEW_FRAMES = 20  # each has a mark
 SHOWN_MS = 0.05  # a stage that takes less, such as reading depth that is given, has no bar
 
 
@@ -103,6 +105,9 @@ def plot_trajectory(figure: Any, result: Result) -> None:
     words = {0: "x, to the right (m)", 2: "z, ahead (m)"}
     axes.set(xlabel=words[across], ylabel=words[upward], title="Camera path from above")
     axes.set_aspect("equal", adjustable="datalim")
+    # The noise of a camera that stands still is no path to fill the picture with.
+    centre = path[:, [across, upward]].mean(axis=0)
+    axes.update_datalim([centre - STILL_M, centre + STILL_M])
     if across == 2:
         axes.invert_yaxis()  # looking ahead is to the right here, so the right is downward
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
@@ -161,7 +166,7 @@ def plot_rpe(figure: Any, result: Result) -> None:
                 rmse, color=_hex(style.INK), lw=1.0, ls="--", label=f"RMSE {rmse:.3g} {unit}"
             )
             axes.legend(loc="upper right")
-            axes.margins(y=0.25)  # room for the legend
+            axes.margins(y=0.35)  # room for the legend
         axes.set(ylabel=f"{label} ({unit})")
         axes.set_ylim(bottom=0.0)
     upper.set_title("Relative pose error of each step")
@@ -197,7 +202,8 @@ def plot_timings(figure: Any, result: Result) -> None:
 
 def _plot_frame_times(axes: Any, totals_ms: Array) -> None:
     """Each frame's time; where few frames took far longer, the axis leaves them out and says so."""
-    axes.plot(totals_ms, color=_hex(style.ESTIMATE), lw=1.0)
+    mark = "." if len(totals_ms) < FEW_FRAMES else ""
+    axes.plot(totals_ms, color=_hex(style.ESTIMATE), lw=1.0, marker=mark)
     axes.set(xlabel="frame", ylabel="ms a frame", title="Time a frame, reading included")
     whole_ticks(axes.xaxis)
     axes.set_ylim(bottom=0.0)
