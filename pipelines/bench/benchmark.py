@@ -155,7 +155,7 @@ def _outcome(result: Result) -> dict[str, Any]:
     entry: dict[str, Any] = {"state": DONE, "frames": counts["frames"]}
     entry["tracked"] = counts["tracked"]
     if counts["interrupted"]:
-        entry |= {"state": STOPPED, "sentence": f"stopped after {counts['frames']} frames"}
+        entry |= {"state": STOPPED, "sentence": f"after {counts['frames']} frames"}
     elif counts["tracked"] == 0:
         entry |= {"state": FAILED, "sentence": "no frame could be tracked; see its run.log"}
     entry["timings"] = {
