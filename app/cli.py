@@ -1,7 +1,7 @@
-"""The command line's words: verbs, flags and examples, and which function runs each verb.
+"""The command line's verbs: what each is for, its examples, and which function runs it.
 
-Owns the parser. Standard library only, so that help comes at once and before any set-up; the
-functions behind the verbs are imported when called.
+Owns the parser; the flags are in `arguments`. Standard library only, so that help comes at once and
+before any set-up; the functions behind the verbs are imported when called.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from importlib import import_module
 
 from app import bootstrap
+from app.arguments import ADDERS
 from app.environment import CORE, DEVELOPMENT, NOTEBOOK, TORCH
 
 PROGRAM = "python3 -m app"
-LATEST = "results/latest"
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,15 @@ optimize RESULT --set batch.method=partial""",
         """\
 render                          # the latest result
 render RESULT --size 1920x1080 --views top""",
+    ),
+    "bench": Verb(
+        "app.bench:bench",
+        "run sequences, compare times and errors, with published figures beside ours",
+        """\
+bench                           # some simulated sequences: nothing to download
+bench --runs 5                  # the paper's table of errors and chart of speed errors
+bench DATA simulated:crossing --frames 100
+bench simulated:kitti_0003 --degrade --set flow.preset=fast""",
     ),
     "prepare": Verb(
         "app.preparation:prepare",
@@ -172,19 +181,6 @@ def build_parser() -> argparse.ArgumentParser:
     parser.examples = _FIRST_EXAMPLES
     parser.set_defaults(verb=None)
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", title="verbs")
-    adders = {
-        "demo": _add_demo,
-        "run": _add_run,
-        "eval": _add_result,
-        "optimize": _add_optimize,
-        "render": _add_render,
-        "prepare": _add_prepare,
-        "doctor": _add_doctor,
-        "config": _add_settings,
-        "datasets": _add_datasets,
-        "models": _add_models,
-        "test": _add_test,
-    }
     for name, verb in VERBS.items():
         sub = verbs.add_parser(
             name,
@@ -194,220 +190,5 @@ def build_parser() -> argparse.ArgumentParser:
         )
         sub.examples = verb.examples
         sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
-        adders[name](sub)
+        ADDERS[name](sub)
     return parser
-
-
-def _add_demo(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--frames", type=_positive, metavar="N", help="stop after N frames")
-    _add_output(parser)
-
-
-def _add_run(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "path", metavar="PATH", help="data folder, or simulated:NAME such as simulated:street"
-    )
-    parser.add_argument("--dataset", metavar="NAME", help="layout, where the guess is wrong")
-    parser.add_argument("--sequence", metavar="NAME", help="which sequence, where PATH holds many")
-    parser.add_argument("--start", type=_not_negative, default=0, metavar="K", help="first frame")
-    parser.add_argument("--frames", type=_positive, metavar="N", help="stop after N frames")
-    parser.add_argument("--stride", type=_positive, default=1, metavar="S", help="every S-th frame")
-    parser.add_argument("--seed", type=_not_negative, metavar="N", help="of all random choices")
-    parser.add_argument(
-        "--degrade",
-        nargs="?",
-        const="all",
-        metavar="WHAT",
-        help="simulated sequences: noisy, worn inputs; all of them, or for example flow,masks",
-    )
-    parser.add_argument(
-        "--provide",
-        metavar="WHAT",
-        help="simulated sequences: which inputs come, of depth,flow,masks,right; 'right' alone is "
-        "a stereo camera and nothing else (default: depth,flow,masks)",
-    )
-    _add_maps(parser)
-    _add_settings(parser)
-    _add_output(parser)
-
-
-def _add_maps(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--save-map", metavar="DIR", help="folder to leave the map in at the end")
-    parser.add_argument(
-        "--load-map", metavar="DIR", help="map to begin with and continue, in its world"
-    )
-    parser.add_argument(
-        "--localize", action="store_true", help="with --load-map: the map stays as it is"
-    )
-
-
-def _add_output(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--output", metavar="DIR", help="result folder (default: a new one in results/)"
-    )
-    parser.add_argument(
-        "--pictures",
-        type=_not_negative,
-        default=1,
-        metavar="N",
-        help="annotate every N-th frame in frames/ (default: 1; 0: none, for timing)",
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress bar and no tables")
-
-
-def _add_settings(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--config", metavar="FILE", help="YAML file with some or all settings")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="A.B=C",
-        dest="overrides",
-        help="one setting; may be given often, and wins over --config",
-    )
-
-
-def _add_result(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "result", metavar="RESULT", nargs="?", default=LATEST, help=f"default: {LATEST}"
-    )
-
-
-def _add_optimize(parser: argparse.ArgumentParser) -> None:
-    _add_result(parser)
-    _add_settings(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress bar and no table")
-
-
-def _add_render(parser: argparse.ArgumentParser) -> None:
-    _add_result(parser)
-    parser.add_argument(
-        "--size", type=_size, default=(1280, 720), metavar="WxH", help="default: 1280x720"
-    )
-    parser.add_argument("--views", nargs="+", choices=VIEWS, default=list(VIEWS), metavar="VIEW")
-    parser.add_argument("--background", choices=("white", "black"), default="white")
-
-
-VIEWS = ("top", "perspective")
-SIZES_PX = (160, 8192)  # smaller pictures hold no text; larger ones no renderer makes
-
-
-KINDS = ("depth", "flow", "masks")  # of files that prepare makes
-
-
-def _add_prepare(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("path", metavar="PATH", help="data folder or video")
-    parser.add_argument("--dataset", metavar="NAME", help="layout, where the guess is wrong")
-    parser.add_argument("--sequence", metavar="NAME", help="which sequence, where PATH holds many")
-    parser.add_argument(
-        "--output",
-        metavar="DIR",
-        help="folder to fill (default: PATH itself where it is a `folder`, else prepared/NAME)",
-    )
-    parser.add_argument(
-        "--what", type=_kinds, default=KINDS, metavar="KINDS", help=f"default: {','.join(KINDS)}"
-    )
-    parser.add_argument("--frames", type=_positive, metavar="N", help="the first N frames alone")
-    parser.add_argument(
-        "--overwrite", action="store_true", help="make anew what prepare has made before"
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress bar and no table")
-    _add_settings(parser)
-
-
-def _add_doctor(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("path", metavar="PATH", nargs="?", help="a data folder to look at")
-    parser.add_argument("--dataset", metavar="NAME", help="layout, where the guess is wrong")
-    parser.add_argument("--sequence", metavar="NAME", help="which sequence, where PATH holds many")
-
-
-def _add_datasets(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", metavar="NAME", nargs="?", help="only this layout")
-
-
-def _add_models(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(action="list")
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions")
-    actions.add_parser("fetch", help="download a file, checked", allow_abbrev=False)
-    add = actions.add_parser("add", help="copy a file of your own in, checked", allow_abbrev=False)
-    export = actions.add_parser(
-        "export", help="make an ONNX file from weights (installs torch)", allow_abbrev=False
-    )
-    train = actions.add_parser(
-        "train-vocabulary", help="learn the words that tell places apart", allow_abbrev=False
-    )
-    for name, action in actions.choices.items():
-        lines = VERBS["models"].examples.splitlines()
-        action.examples = "\n".join(line for line in lines if line.startswith(f"models {name}"))
-        action.add_argument("--debug", action="store_true", help="show the traceback of an error")
-        if action is not train:
-            action.add_argument("name", metavar="NAME", help="as `models` lists them")
-    add.add_argument("file", metavar="FILE")
-    export.add_argument("--weights", metavar="FILE", help="default: the published ones, fetched")
-    export.add_argument("--output", metavar="FILE", help="default: where `run` looks for it")
-    export.add_argument(
-        "--unchecked", action="store_true", help="take weights that are not the published ones"
-    )
-    _add_train_vocabulary(train)
-
-
-def _add_train_vocabulary(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "images",
-        metavar="IMAGES",
-        nargs="*",
-        help="images, folders of images, or sequences as `run` takes them (default: those that "
-        "the shipped vocabulary is made of, which takes minutes)",
-    )
-    parser.add_argument("--output", metavar="FILE", required=True, help="to write, a .npz")
-    parser.add_argument(
-        "--stride", type=_positive, default=1, metavar="S", help="every S-th image of each source"
-    )
-    parser.add_argument(
-        "--branching", type=_positive, default=32, metavar="K", help="children of a node at most"
-    )
-    parser.add_argument(
-        "--depth", type=_positive, default=3, metavar="L", help="levels of the tree"
-    )
-    parser.add_argument(
-        "--seed", type=_not_negative, default=0, metavar="N", help="of the centroids"
-    )
-
-
-def _add_test(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "pytest_arguments", metavar="ARGUMENT", nargs="*", help="handed on to pytest"
-    )
-
-
-def _positive(text: str) -> int:
-    value = _not_negative(text)
-    if value == 0:
-        raise argparse.ArgumentTypeError("expected a whole number of at least 1, found '0'")
-    return value
-
-
-def _not_negative(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"expected a whole number, found '{text}'")
-    return int(text)
-
-
-def _kinds(text: str) -> tuple[str, ...]:
-    kinds = tuple(word.strip() for word in text.split(","))
-    unknown = [kind for kind in kinds if kind not in KINDS]
-    if unknown:
-        raise argparse.ArgumentTypeError(f"expected some of {','.join(KINDS)}, found '{text}'")
-    return kinds
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, cross, height = text.lower().partition("x")
-    if not (cross and width.isdecimal() and height.isdecimal()):
-        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT as in 1280x720, found '{text}'")
-    low, high = SIZES_PX
-    if not all(low <= int(side) <= high for side in (width, height)):
-        raise argparse.ArgumentTypeError(
-            f"expected sides of {low} to {high} pixels, found '{text}'"
-        )
-    return int(width), int(height)

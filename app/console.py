@@ -180,6 +180,18 @@ def rows(cells: Iterable[tuple[str, ...]]) -> None:
         say("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip())
 
 
+def tables(text: str) -> None:
+    """Markdown whose tables are aligned already: the headings stand out, the rest as it is."""
+    for line in text.splitlines():
+        words = line.lstrip("#").strip() if line.startswith("#") else line
+        stdout.print(Text(words, style="bold" if words != line else ""), soft_wrap=True)
+
+
+def remark(text: str) -> None:
+    """One line on stderr: what goes on, not what comes out."""
+    stderr.print(text, **_PLAIN)
+
+
 def pictures(files: Iterable[Path]) -> None:
     """Name the files that were drawn."""
     for file in files:

@@ -128,7 +128,7 @@ def render(arguments: Namespace) -> int:
     return 0
 
 
-def _keep_freed_memory() -> None:
+def keep_freed_memory() -> None:
     """Let glibc keep the pages of freed images for the next frame's, a tenth of its time.
 
     By default each image is mapped anew and its pages are faulted in one by one.
@@ -145,7 +145,7 @@ def _process(
     from pipelines.runner import run as run_sequence
     from viz.overlay import FrameWriter
 
-    _keep_freed_memory()
+    keep_freed_memory()
     sinks: list[Any] = [] if arguments.quiet else [console.Progress()]
     if arguments.pictures:
         sinks.append(FrameWriter(every=arguments.pictures))

@@ -11,7 +11,15 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 RANK = {"pipelines": 0, "viz": 1, "app": 2}
-STDLIB_ONLY = ("cli", "bootstrap", "environment", "installation", "system_libraries", "__main__")
+STDLIB_ONLY = (
+    "cli",
+    "arguments",
+    "bootstrap",
+    "environment",
+    "installation",
+    "system_libraries",
+    "__main__",
+)
 # Heavy packages and the only places that may import them at all.
 OWNERS = {
     "gtsam": ("pipelines/backend/",),

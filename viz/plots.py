@@ -1,12 +1,12 @@
-"""Diagrams of a result folder: the path against the truth, errors over frames, time a stage.
+"""Diagrams of a result: the table of what there is, and those of the camera and of time.
 
-Owns matplotlib. Needs no display.
+Owns which diagram a result allows. `object_plots` draws the objects, `figures` makes the paper.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,33 +17,32 @@ from pipelines.evaluation.camera import align, associate, relative_errors
 from pipelines.evaluation.folder import truth_by_frame
 from pipelines.geometry import rotation_angle_deg
 from pipelines.io import folder as names
-from pipelines.io.files import disk_error, replacing
+from pipelines.io.files import disk_error
 from pipelines.io.result import Result, load_result
 from pipelines.io.timings import TOTAL, WALL, stage_summaries
 from pipelines.types import Array
-from viz import style
-from viz.object_plots import moving_ids, plot_object_speeds, plot_object_timeline
+from viz import object_plots, style
+from viz.figures import metric_unit, new_figure, save_figure, whole_ticks
 from viz.style import hex_color as _hex
 
-SETTINGS = {
-    "font.size": 11,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e4e4e4",
-    "axes.axisbelow": True,
-    "legend.framealpha": 0.9,
-    "legend.edgecolor": "none",
-    "figure.dpi": 110,
-}
+STILL_M = 0.05  # to either side is shown at the least
+FEW_FRAMES = 20  # each has a mark
+SHOWN_MS = 0.05  # a stage that takes less, such as reading depth that is given, has no bar
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """A diagram: the function that draws it, and whether a result has what it needs."""
+
+    draw: Callable[[Any, Result], None]
+    is_possible: Callable[[Result], bool]
+    needs: str
 
 
 def plot_result(folder: Path | str) -> list[Path]:
-    """Write plots/*.png of a result folder, those that its files allow; the paths written.
+    """Write plots/NAME.png of a result folder, those of PLOTS that its files allow; the paths.
 
-    trajectory.png: the path from above, with the truth. rpe.png: error of every step. timings.png:
-    what a frame costs. objects_speed.png and objects_timeline.png: moving objects, see
-    `object_plots`. Raises FormatError for a damaged folder.
+    Raises FormatError for a damaged folder.
     """
     result = load_result(folder)
     target = result.folder / names.PLOTS
@@ -52,36 +51,38 @@ def plot_result(folder: Path | str) -> list[Path]:
     except OSError as error:
         raise DyObError(disk_error(target, error)) from error
     written = []
-    truth = result.gt_Ts_world_camera is not None and len(result.gt_Ts_world_camera) > 1
-    jobs = [("trajectory.png", _plot_trajectory, len(result.timestamps_s) > 0)]
-    jobs.append(("rpe.png", _plot_rpe, truth and len(result.timestamps_s) > 1))
-    jobs.append(("timings.png", _plot_timings, bool(stage_summaries(result.timings))))
-    jobs.append(("objects_speed.png", plot_object_speeds, len(moving_ids(result.objects)) > 0))
-    jobs.append(("objects_timeline.png", plot_object_timeline, len(result.objects) > 0))
-    for name, plot, possible in jobs:
-        if possible:
-            with _figure(target / name) as figure:
-                plot(figure, result)
-            written.append(target / name)
+    for name in possible_plots(result):
+        save_figure(figure_of(result, name), target / f"{name}.png")
+        written.append(target / f"{name}.png")
     return written
 
 
-@contextmanager
-def _figure(path: Path) -> Iterator[Any]:
-    """A figure that is written to `path` when the block ends; no global state of matplotlib."""
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(SETTINGS):
-        figure = Figure(figsize=(9.0, 5.2), layout="constrained")
-        FigureCanvasAgg(figure)
-        yield figure
-        with replacing(path) as fresh:
-            figure.savefig(fresh)
+def possible_plots(result: Result) -> list[str]:
+    """Names of the diagrams that a result allows, in the order of PLOTS."""
+    return [name for name, plot in PLOTS.items() if plot.is_possible(result)]
 
 
-def _plot_trajectory(figure: Any, result: Result) -> None:
+def figure_of(result: Result | Path | str, name: str) -> Any:
+    """The diagram `name` of PLOTS as a matplotlib figure; no file is written.
+
+    A notebook shows it where it is the last value of a cell. Raises DyObError for an unknown name
+    and where the result lacks what it needs.
+    """
+    if name not in PLOTS:
+        raise DyObError(f"expected a diagram of {', '.join(PLOTS)}, found '{name}'; name one")
+    if not isinstance(result, Result):
+        result = load_result(result)
+    if not PLOTS[name].is_possible(result):
+        raise DyObError(
+            f"{result.folder}: the diagram '{name}' needs {PLOTS[name].needs}, and this result has "
+            f"none; it allows {', '.join(possible_plots(result)) or 'no diagram'}"
+        )
+    with new_figure() as figure:
+        PLOTS[name].draw(figure, result)
+    return figure
+
+
+def plot_trajectory(figure: Any, result: Result) -> None:
     """The ground plane from above, the longer side across; where the truth is known, the error."""
     path = result.Ts_world_camera[:, :3, 3]
     truth = None if result.gt_Ts_world_camera is None else result.gt_Ts_world_camera[:, :3, 3]
@@ -101,9 +102,12 @@ def _plot_trajectory(figure: Any, result: Result) -> None:
     axes.plot(*path[:, [across, upward]].T, color=_hex(style.ESTIMATE), lw=1.8, label="estimate")
     axes.plot(*path[0, [across, upward]], "o", color=_hex(style.START), ms=8, label="start")
     axes.plot(*path[-1, [across, upward]], "o", color=_hex(style.END), ms=8, label="end")
-    names = {0: "x, to the right (m)", 2: "z, ahead (m)"}
-    axes.set(xlabel=names[across], ylabel=names[upward], title="Camera path from above")
+    words = {0: "x, to the right (m)", 2: "z, ahead (m)"}
+    axes.set(xlabel=words[across], ylabel=words[upward], title="Camera path from above")
     axes.set_aspect("equal", adjustable="datalim")
+    # The noise of a camera that stands still is no path to fill the picture with.
+    centre = path[:, [across, upward]].mean(axis=0)
+    axes.update_datalim([centre - STILL_M, centre + STILL_M])
     if across == 2:
         axes.invert_yaxis()  # looking ahead is to the right here, so the right is downward
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
@@ -122,16 +126,19 @@ def _position_errors(result: Result) -> tuple[Array, Array]:
 
 
 def _plot_position_errors(axes: Any, seconds: Array, errors_m: Array) -> None:
-    rmse_cm = 100.0 * float(np.sqrt(np.mean(errors_m**2)))
-    axes.plot(seconds, 100.0 * errors_m, ".-", color=_hex(style.ESTIMATE), lw=1.0, ms=4)
-    axes.axhline(rmse_cm, color=_hex(style.INK), lw=1.0, ls="--", label=f"ATE {rmse_cm:.3g} cm")
-    axes.set(xlabel="time (s)", ylabel="off by (cm)", title="Distance to the truth after alignment")
+    factor, unit = metric_unit(errors_m)
+    rmse = factor * float(np.sqrt(np.mean(errors_m**2)))
+    axes.plot(seconds, factor * errors_m, ".-", color=_hex(style.ESTIMATE), lw=1.0, ms=4)
+    axes.axhline(rmse, color=_hex(style.INK), lw=1.0, ls="--", label=f"ATE {rmse:.3g} {unit}")
+    title = "Distance to the truth after alignment"
+    axes.set(xlabel="time (s)", ylabel=f"off by ({unit})", title=title)
     axes.margins(y=0.25)
     axes.set_ylim(bottom=0.0)
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
-def _plot_rpe(figure: Any, result: Result) -> None:
+def plot_rpe(figure: Any, result: Result) -> None:
+    """The error of every step from frame to frame; a gap where a frame was lost."""
     stamps, gt = truth_by_frame(result)
     rows, gt_rows = associate(result.timestamps_s, stamps)
     known = np.isfinite(gt[gt_rows]).all((1, 2))
@@ -139,54 +146,107 @@ def _plot_rpe(figure: Any, result: Result) -> None:
     consecutive = np.diff(gt_rows) == 1
     E = relative_errors(result.Ts_world_camera[rows], gt[gt_rows])[consecutive]
     at = gt_rows[1:][consecutive]
+    index = np.array(result.timings.get("frames_index") or [0, 1])
+    stride = np.diff(index).min() if len(index) > 1 else 1
+    frames = index[0] + stride * np.arange(len(stamps))
+    trans_m = np.linalg.norm(E[:, :3, 3], axis=1)
+    factor, unit = metric_unit(trans_m)
     errors = (
-        (1000.0 * np.linalg.norm(E[:, :3, 3], axis=1), "translation", "mm", style.ESTIMATE),
+        (factor * trans_m, "translation", unit, style.ESTIMATE),
         (rotation_angle_deg(E), "rotation", "deg", style.END),
     )
     upper, lower = figure.subplots(2, 1, sharex=True)
     for axes, (values, label, unit, color) in zip((upper, lower), errors, strict=True):
         by_frame = np.full(len(stamps), np.nan)  # lost frames leave a gap in the line
         by_frame[at] = values
-        axes.plot(by_frame, ".-", color=_hex(color), lw=1.0, ms=4)
+        axes.plot(frames, by_frame, ".-", color=_hex(color), lw=1.0, ms=4)
         if len(values):
             rmse = float(np.sqrt(np.mean(values**2)))
             axes.axhline(
                 rmse, color=_hex(style.INK), lw=1.0, ls="--", label=f"RMSE {rmse:.3g} {unit}"
             )
             axes.legend(loc="upper right")
-            axes.margins(y=0.25)  # room for the legend
+            axes.margins(y=0.35)  # room for the legend
         axes.set(ylabel=f"{label} ({unit})")
         axes.set_ylim(bottom=0.0)
     upper.set_title("Relative pose error of each step")
     lower.set_xlabel("frame")
+    whole_ticks(lower.xaxis)
 
 
-def _plot_timings(figure: Any, result: Result) -> None:
+def plot_timings(figure: Any, result: Result) -> None:
     """Cost over frames above, medians and 95th percentiles of the stages below."""
-    stages = stage_summaries(result.timings)
-    totals_ms = np.array(result.timings.get("frames_total_ms", []), float)
+    stages = {
+        name: values
+        for name, values in stage_summaries(result.timings).items()
+        if values["p95_ms"] >= SHOWN_MS or name in (TOTAL, WALL)
+    }
+    figure.set_size_inches(figure.get_figwidth(), 3.0 + 0.26 * len(stages))
     upper, lower = figure.subplots(2, 1, height_ratios=(1.0, 0.35 + 0.16 * len(stages)))
-    upper.plot(totals_ms, color=_hex(style.ESTIMATE), lw=1.0)
-    if len(totals_ms):
-        median_ms = float(np.median(totals_ms))
-        upper.axhline(
-            median_ms, color=_hex(style.INK), lw=1.0, ls="--", label=f"median {median_ms:.1f} ms"
-        )
-        upper.legend(loc="upper right")
-        upper.margins(y=0.3)
-    upper.set(xlabel="frame", ylabel="ms a frame", title="Time a frame, reading included")
-    upper.set_ylim(bottom=0.0)
+    _plot_frame_times(upper, np.array(result.timings.get("frames_total_ms", []), float))
     sums = {TOTAL: "all work", WALL: "on the clock"}
     labels = [sums.get(name, name.replace("_", " ")) for name in stages]
     medians = np.array([values["median_ms"] for values in stages.values()])
     p95 = np.array([values["p95_ms"] for values in stages.values()])
     colors = [_hex(style.INK if name in (TOTAL, WALL) else style.ESTIMATE) for name in stages]
-    lower.barh(labels, p95, color="#d5dce4", label="95th percentile")
-    lower.barh(labels, medians, color=colors, height=0.5, label="median")
+    lower.barh(labels, p95, color="#d5dce4")
+    lower.barh(labels, medians, color=colors, height=0.5)
     for row, value in enumerate(medians):
-        lower.annotate(
-            f"{value:.1f}", (p95[row], row), (4, 0), textcoords="offset points", va="center"
-        )
+        words = f"{value:.1f}  ({p95[row]:.1f})"
+        lower.annotate(words, (p95[row], row), (4, 0), textcoords="offset points", va="center")
     lower.invert_yaxis()
-    lower.margins(x=0.08)
-    lower.set(xlabel="ms a frame: median (number) and 95th percentile (light)")
+    lower.grid(visible=False, axis="y")
+    lower.margins(x=0.18)
+    lower.set(xlabel="ms a frame: median, and the 95th percentile (light bar, in brackets)")
+
+
+def _plot_frame_times(axes: Any, totals_ms: Array) -> None:
+    """Each frame's time; where few frames took far longer, the axis leaves them out and says so."""
+    mark = "." if len(totals_ms) < FEW_FRAMES else ""
+    axes.plot(totals_ms, color=_hex(style.ESTIMATE), lw=1.0, marker=mark)
+    axes.set(xlabel="frame", ylabel="ms a frame", title="Time a frame, reading included")
+    whole_ticks(axes.xaxis)
+    axes.set_ylim(bottom=0.0)
+    if len(totals_ms) == 0:
+        return
+    median_ms = float(np.median(totals_ms))
+    words = f"median {median_ms:.1f} ms"
+    axes.axhline(median_ms, color=_hex(style.INK), lw=1.0, ls="--", label=words)
+    slowest = int(totals_ms.argmax())
+    usual_ms = 1.6 * float(np.quantile(totals_ms, 0.95))
+    if totals_ms[slowest] > 1.5 * usual_ms:
+        axes.set_ylim(0.0, usual_ms)
+        words = f"slowest {totals_ms[slowest]:.0f} ms, frame {slowest}"
+        axes.plot([], [], color=_hex(style.ESTIMATE), lw=1.0, label=words)
+    else:
+        axes.set_ylim(0.0, 1.35 * totals_ms[slowest])
+    axes.legend(loc="upper right", ncols=2)
+
+
+def _has_path(result: Result) -> bool:
+    return len(result.timestamps_s) > 0
+
+
+def _has_true_steps(result: Result) -> bool:
+    truth = result.gt_Ts_world_camera
+    return truth is not None and len(truth) > 1 and len(result.timestamps_s) > 1
+
+
+PLOTS: dict[str, Plot] = {
+    "trajectory": Plot(plot_trajectory, _has_path, "a tracked frame"),
+    "rpe": Plot(plot_rpe, _has_true_steps, "the camera's ground truth"),
+    "timings": Plot(plot_timings, lambda r: bool(stage_summaries(r.timings)), "timings.json"),
+    "objects_speed": Plot(
+        object_plots.plot_object_speeds,
+        lambda r: len(object_plots.moving_ids(r.objects)) > 0,
+        f"an object that moved for {object_plots.MIN_MOVING_FRAMES} frames",
+    ),
+    "objects_motion": Plot(
+        object_plots.plot_object_motion,
+        lambda r: len(object_plots.judged_objects(r)) > 0,
+        "moving objects with ground truth",
+    ),
+    "objects_timeline": Plot(
+        object_plots.plot_object_timeline, lambda r: len(r.objects) > 0, "a tracked object"
+    ),
+}

@@ -197,7 +197,7 @@ def _per_object(
     scored: NDArray[np.int64],
     errors: dict[str, Array],
 ) -> dict[str, Any]:
-    """By the true id: what was found of it, by which ids, and its RMSEs."""
+    """By the true id: what was found of it, by which ids, those that were scored, and errors."""
     row = matches.truth_row
     true_id = truth.object_id[row[scored]]
     shown_by: dict[int, list[int]] = {
@@ -213,14 +213,17 @@ def _per_object(
         wanted = int((steps.is_wanted & is_own).sum())
         hits = scored[which & steps.is_wanted[row[scored]]]
         speed = _speed_errors(errors["speed_kmh"][which], errors["speed_std_kmh"][which])
+        trans = statistics("trans", "m", errors["trans_m"][which])
+        rot = statistics("rot", "deg", errors["rot_deg"][which])
         blocks[str(j)] = {
             "class_name": str(truth.class_name[is_own][0]),
             "moves": bool(truth.moving[is_own][0]),
             "estimated_ids": ids,
+            "scored_ids": list(dict.fromkeys(estimates.object_id[scored[which]].tolist())),
             "object_frames": int(which.sum()),
             "coverage_share": len(hits) / wanted if wanted else None,
-            "trans_rmse_m": statistics("t", "m", errors["trans_m"][which])["t_rmse_m"],
-            "rot_rmse_deg": statistics("r", "deg", errors["rot_deg"][which])["r_rmse_deg"],
+            **{key: trans[key] for key in ("trans_rmse_m", "trans_median_m")},
+            **{key: rot[key] for key in ("rot_rmse_deg", "rot_median_deg")},
             "speed_signed_mean_kmh": speed["signed_mean_kmh"],
             "speed_abs_mean_kmh": speed["error_mean_kmh"],
         }

@@ -36,8 +36,10 @@ LATEST = "latest"
 logger = logging.getLogger("dyob.io")
 
 
-def create_result_folder(root: Path | str, name: str) -> Path:
+def create_result_folder(root: Path | str, name: str, *, is_latest: bool = True) -> Path:
     """Make `root/<YYYYmmdd-HHMMSS>-<name>`, never one that exists, and point `root/latest` to it.
+
+    The link stays where it is without `is_latest`, of folders that are no run's.
 
     Characters of `name` that a path should not hold become "_". Raises DyObError where the disk
     refuses; a `latest` that cannot be made is a warning only.
@@ -53,7 +55,8 @@ def create_result_folder(root: Path | str, name: str) -> Path:
             f"{root}: expected a folder to put results in, found '{error.strerror}'; "
             "choose another --output"
         ) from error
-    _point_latest(root, folder.name)
+    if is_latest:
+        _point_latest(root, folder.name)
     return folder
 
 
@@ -63,7 +66,7 @@ def clear_result_folder(folder: Path | str) -> None:
     Raises DyObError where it holds files but is no run's, such as a folder of data.
     """
     folder = Path(folder)
-    _check_output(folder)
+    check_output(folder, LOG)
     files = [CONFIG, LOG, CAMERA_TUM, CAMERA_KITTI, CAMERA_GT_TUM, STATIC_MAP]
     files += [OBJECTS_CSV, OBJECTS_GT_CSV, CAMERA_STD]
     stale = [folder / name for name in (*files, METRICS_JSON, METRICS_TXT, TIMINGS)]
@@ -82,8 +85,11 @@ def clear_result_folder(folder: Path | str) -> None:
         ) from error
 
 
-def _check_output(folder: Path) -> None:
-    """A new or empty folder or an earlier run's; in others, files of these names may be dear."""
+def check_output(folder: Path, mark: str) -> None:
+    """Make `folder`; one that is there must be empty or hold `mark`, as an earlier result does.
+
+    In others, files of a result's names may be dear. Raises DyObError.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         held = sorted(path.name for path in folder.iterdir())
@@ -93,10 +99,10 @@ def _check_output(folder: Path) -> None:
             f"{folder}: expected a folder to put the result in, found {found}; "
             "choose another --output"
         ) from error
-    if held and LOG not in held:
+    if held and mark not in held:
         more = " and more" if len(held) > 3 else ""
         raise DyObError(
-            f"{folder}: expected a new or empty folder or an earlier result with {LOG}, "
+            f"{folder}: expected a new or empty folder or an earlier result with {mark}, "
             f"found {', '.join(held[:3])}{more} in it; choose another --output"
         )
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from app import bootstrap, cli
+from app import arguments, bootstrap, cli
 
 HEAVY = ("numpy", "scipy", "cv2", "open3d", "rich", "yaml", "matplotlib", "gtsam", "evo", "logging")
 
@@ -137,6 +137,6 @@ def test_render_offers_what_the_renderer_can_draw() -> None:
     from viz.style import BACKGROUNDS
     from viz.views import VIEW_NAMES
 
-    assert cli.VIEWS == VIEW_NAMES
+    assert arguments.VIEWS == VIEW_NAMES
     for background in BACKGROUNDS:
         cli.build_parser().parse_args(["render", "--background", background])

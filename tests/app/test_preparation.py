@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from app import cli, preparation
+from app import arguments, cli, preparation
 from pipelines.datasets import open_sequence
 from pipelines.prepare import KINDS
 
@@ -80,4 +80,4 @@ def test_a_stop_is_no_error_and_says_how_to_go_on(stereo_folder, monkeypatch, ca
 
 
 def test_the_words_are_those_of_the_work() -> None:
-    assert cli.KINDS == KINDS
+    assert arguments.KINDS == KINDS

@@ -1,10 +1,15 @@
 """Diagrams: those that the files allow, readable and not blank."""
 
+import json
+
 import cv2
 import numpy as np
+import pytest
 
+from pipelines.errors import DyObError
+from pipelines.evaluation import evaluate_result
 from pipelines.geometry import exp_se3
-from pipelines.io.result import ResultWriter
+from pipelines.io.result import ResultWriter, load_result
 from pipelines.object_types import ObjectEstimates
 from pipelines.types import (
     FrameResult,
@@ -14,7 +19,7 @@ from pipelines.types import (
     TrackingStatus,
 )
 from viz import style
-from viz.plots import plot_result
+from viz.plots import figure_of, plot_result, possible_plots
 
 
 def write(folder, n: int, *, truth: bool, timings: bool = True) -> None:
@@ -114,6 +119,53 @@ def test_objects_have_their_diagrams(tmp_path):
     assert full > 3 * thin > 300  # predicted only: a thin line
     shade = 255 - 0.42 * (255 - np.array(parked))
     assert (np.abs(lives - shade).sum(2) < 12).sum() > 2 * thin
+
+
+def test_each_moving_object_has_its_error_of_motion(tmp_path):
+    """Only where it is evaluated; the bars are as long as the figures in metrics.json."""
+    write_objects(tmp_path)
+    assert "objects_motion" not in possible_plots(load_result(tmp_path))
+    evaluate_result(tmp_path)
+    path = tmp_path / "metrics.json"
+    metrics = json.loads(path.read_text())
+    block = metrics["objects"]["per_object"]["1"]
+    assert block["scored_ids"] == [1]
+    block.update(trans_rmse_m=0.04, trans_median_m=0.03, rot_rmse_deg=0.5, rot_median_deg=0.7)
+    path.write_text(json.dumps(metrics))
+    left, right = figure_of(tmp_path, "objects_motion").axes
+    assert [text.get_text() for text in left.get_yticklabels()] == ["1 car, 29 frames"]
+    assert [bar.get_width() for bar in left.patches] == pytest.approx([4.0])
+    assert "cm" in left.get_xlabel()
+    assert [bar.get_width() for bar in right.patches] == pytest.approx([0.5])
+    assert right.lines[0].get_xdata() == pytest.approx([0.7])
+    assert right.get_xlim()[1] > 0.7
+
+
+def test_a_figure_shows_itself_and_writes_no_file(tmp_path):
+    write(tmp_path, 30, truth=True)
+    files = sorted(tmp_path.rglob("*"))
+    picture = figure_of(load_result(tmp_path), "rpe")._repr_png_()
+    assert cv2.imdecode(np.frombuffer(picture, np.uint8), 1).shape == (780, 1350, 3)
+    assert sorted(tmp_path.rglob("*")) == files
+
+
+def test_a_figure_that_cannot_be_is_one_sentence(tmp_path):
+    write(tmp_path, 5, truth=False)
+    with pytest.raises(DyObError, match="needs the camera's ground truth"):
+        figure_of(tmp_path, "rpe")
+    with pytest.raises(DyObError, match="found 'rpr'"):
+        figure_of(tmp_path, "rpr")
+
+
+def test_one_slow_frame_does_not_flatten_the_others(tmp_path):
+    write(tmp_path, 30, truth=False)
+    path = tmp_path / "timings.json"
+    timings = json.loads(path.read_text())
+    timings["frames_total_ms"][0] = 900.0
+    path.write_text(json.dumps(timings))
+    upper = figure_of(tmp_path, "timings").axes[0]
+    assert 14.0 < upper.get_ylim()[1] < 40.0
+    assert "slowest 900 ms, frame 0" in [text.get_text() for text in upper.get_legend().texts]
 
 
 def test_stopped_objects_alone_have_no_speeds_to_show(tmp_path):

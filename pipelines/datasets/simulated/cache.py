@@ -60,6 +60,12 @@ def ensure_folder(folder: Path, key: dict[str, Any], make: Callable[[Path], None
     return folder
 
 
+def forget(folder: Path) -> None:
+    """Remove a cached sequence; degraded inputs take half a gigabyte and are made in a minute."""
+    if (folder / _MANIFEST).is_file():  # nothing but what was made here
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def is_whole(folder: Path, key: dict[str, Any]) -> bool:
     """Whether the folder was finished for this `key` and has every file in its full size."""
     try:

@@ -63,6 +63,7 @@ class SimulatedSequence(Sequence):
         *,
         frames: int | None = None,
         seed: int = 0,
+        noise_seed: int | None = None,
         degrade: str | Iterable[str] | Degradation | None = None,
         provide: str | Iterable[str] = ("depth", "flow", "masks"),
         scale: float = 1.0,
@@ -73,7 +74,8 @@ class SimulatedSequence(Sequence):
         """Open, and at first render, a scene.
 
         spec: name of the scene, with or without `simulated:`. frames, scale: length, and size as
-        a share of the scene's own. degrade: see `Degradation.of`. provide: which of depth, flow,
+        a share of the scene's own. seed: of the scene and of its faults, unless noise_seed gives
+        the same scene other faults. degrade: see `Degradation.of`. provide: which of depth, flow,
         masks and right the frames bring. labels: for kitti_NNNN, the folder of KITTI tracking's
         labels; $DYOB_KITTI_TRACKING where None. progress: called with (done, total) frames of each
         stage that is rendered: left, right, degraded.
@@ -82,8 +84,9 @@ class SimulatedSequence(Sequence):
         self._scene: Scene = find_scene(_scene_name(spec), labels)
         self._frames = self._scene.frames if frames is None else int(frames)
         self._seed, self._progress = int(seed), progress
+        self._noise_seed = self._seed if noise_seed is None else int(noise_seed)
         self._provide = _inputs(provide)
-        if self._frames < 1 or not 0.05 <= scale <= 4 or self._seed < 0:
+        if self._frames < 1 or not 0.05 <= scale <= 4 or min(self._seed, self._noise_seed) < 0:
             raise ConfigError(
                 "a simulated sequence needs frames >= 1, seed >= 0 and 0.05 <= scale <= 4, "
                 f"found frames={frames}, seed={seed}, scale={scale}"
@@ -116,6 +119,8 @@ class SimulatedSequence(Sequence):
             self._right = self._folder(base, "right", {"right": True}, self._render_right)
         if self._how.any:
             faults = {"degrade": asdict(self._how), "right": "right" in self._provide}
+            if self._noise_seed != self._seed:
+                faults["noise_seed"] = self._noise_seed
             self._worn = self._folder(base, "degraded", faults, self._wear)
             self.root = self._worn
         self.__dict__.pop("_renderer", None)  # its textures and rays take 200 MB
@@ -352,12 +357,12 @@ class SimulatedSequence(Sequence):
             flow = rigid_flow(self.camera, depth, found["labels"], motions)
             image = blur_along(image, flow, how.blur_share)
         if how.touches_image:
-            gain = float(exposure_gain(self.timestamps_s, how, self._seed)[index])
+            gain = float(exposure_gain(self.timestamps_s, how, self._noise_seed)[index])
             image = worn_image(image, gain, how, self._rng(index, 4 if right else 3))
         return image
 
     def _rng(self, index: int, purpose: int) -> np.random.Generator:
-        return np.random.default_rng([self._seed, index, purpose])
+        return np.random.default_rng([self._noise_seed, index, purpose])
 
 
 def _scene_name(spec: str) -> str:

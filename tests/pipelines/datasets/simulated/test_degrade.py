@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pipelines.datasets.simulated import SimulatedSequence
+from pipelines.datasets.simulated.cache import forget
 from pipelines.datasets.simulated.degrade import Degradation, exposure_gain, worn_depth, worn_masks
 from pipelines.datasets.simulated.motion import blur_along
 from pipelines.errors import ConfigError
@@ -43,6 +44,21 @@ def test_each_fault_touches_its_own_input_alone(street, cache, word, touched):
     a, b = street.ground_truth(), worn.ground_truth()
     assert (a.Ts_world_camera == b.Ts_world_camera).all()
     assert (a.objects.Ts_world_object == b.objects.Ts_world_object).all()
+
+
+def test_other_faults_befall_the_same_scene(street, cache):
+    """A noise seed alters the faults alone; that of the scene is no other sequence."""
+    same, other = (worn_street(cache, "disparity", noise_seed=n) for n in (0, 1))
+    assert same.root == worn_street(cache, "disparity").root != other.root
+    depths = [sequence.read(2).depth_m for sequence in (same, other, street)]
+    assert np.array_equal(other.read(2).image, street.read(2).image)
+    apart = [np.nanmedian(np.abs(depths[k] - depths[2])) for k in (0, 1)]
+    assert apart[0] == pytest.approx(apart[1], rel=0.1) and min(apart) > 0.0
+    assert not np.array_equal(depths[0], depths[1], equal_nan=True)
+    forget(other.root)
+    assert not other.root.exists() and street.root.exists()
+    forget(cache)  # holds sequences, but is none
+    assert street.root.exists()
 
 
 def test_disparity_noise_is_a_third_of_a_pixel(street, cache):
