@@ -99,12 +99,22 @@ def _T_world_box(objects: ObjectEstimates, row: int) -> Array:
 
 
 def _box(objects: ObjectEstimates, row: int, T_world_box: Array, size_m: Array) -> ObjectBox:
+    if objects.class_name[row] in LARGEST_M:  # these stand on the ground, whatever noise says
+        T_world_box = make_T(_upright(T_world_box[:3, :3]), T_world_box[:3, 3])
     across_m, high_m = LARGEST_M.get(str(objects.class_name[row]), LARGEST_OF_OTHERS_M)
     size_m = np.clip(size_m, SMALLEST_SIDE_M, (across_m, high_m, across_m))
     return ObjectBox(
         int(objects.object_id[row]), T_world_box, size_m,
         str(objects.state[row]), label_text(objects, row), row,
     )  # fmt: skip
+
+
+def _upright(R: Array) -> Array:
+    """The rotation (3, 3) whose y axis is the world's, and whose x axis is nearest to that of R."""
+    level = R * [[1.0], [0.0], [1.0]]
+    x = level[:, 0] if np.linalg.norm(level[:, 0]) > 0.5 else np.cross((0.0, 1.0, 0.0), level[:, 2])
+    x = x / np.linalg.norm(x)
+    return np.column_stack([x, (0.0, 1.0, 0.0), np.cross(x, (0.0, 1.0, 0.0))])
 
 
 def _rigid_stretches(objects: ObjectEstimates, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:

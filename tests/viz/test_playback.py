@@ -66,6 +66,22 @@ def test_corners_enclose_what_the_box_holds():
     assert (local[0b101] > 0).tolist() == [True, False, True]
 
 
+def test_what_stands_on_the_ground_stays_upright_in_its_heading():
+    objects = car()
+    tilt = exp_se3(np.array([0.3, 0.0, -0.2, 0.0, 0.0, 0.0]))[:3, :3]
+    Ls = objects.Ts_world_object.copy()
+    Ls[:, :3, :3] = Ls[:, :3, :3] @ tilt
+    for box, straight in zip(
+        frame_boxes(replace(objects, Ts_world_object=Ls)), frame_boxes(objects), strict=True
+    ):
+        R, R_straight = box.T_world_box[:3, :3], straight.T_world_box[:3, :3]
+        np.testing.assert_allclose(R[:, 1], [0.0, 1.0, 0.0], atol=1e-12)
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(R) > 0.99 and R[:, 0] @ R_straight[:, 0] > 0.97
+    tumbling = replace(objects, Ts_world_object=Ls, class_name=np.full(8, "object"))
+    np.testing.assert_allclose(frame_boxes(tumbling)[0].T_world_box[:3, :3], Ls[0, :3, :3])
+
+
 def test_what_is_unknown_has_no_box_and_noise_makes_none_larger_than_its_kind():
     objects = car()
     state = objects.state.astype("U16")
