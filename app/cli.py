@@ -43,6 +43,7 @@ run DATA                        # the layout is guessed from the folder
 run DATA --dataset tum_rgbd --frames 100 --stride 2
 run simulated:street --degrade --seed 7
 run DATA --set orb.n_features=1500 --output my_result
+run DATA --viewer meshcat       # watch it in the browser
 run DATA --save-map my_map      # and later, where the map is known:
 run DATA --load-map my_map --localize""",
     ),
@@ -67,6 +68,14 @@ optimize RESULT --set batch.method=partial""",
         """\
 render                          # the latest result
 render RESULT --size 1920x1080 --views top""",
+    ),
+    "view": Verb(
+        "app.viewing:view",
+        "show a result folder in the browser, with a time slider",
+        """\
+view                            # the latest result, on this machine alone
+view RESULT --export my_scene.html
+view RESULT --host 0.0.0.0      # for others, who need the token in its address""",
     ),
     "prepare": Verb(
         "app.preparation:prepare",
@@ -178,6 +187,7 @@ def build_parser() -> argparse.ArgumentParser:
         "eval": _add_result,
         "optimize": _add_optimize,
         "render": _add_render,
+        "view": _add_view,
         "prepare": _add_prepare,
         "doctor": _add_doctor,
         "config": _add_settings,
@@ -226,6 +236,8 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         help="simulated sequences: which inputs come, of depth,flow,masks,right; 'right' alone is "
         "a stereo camera and nothing else (default: depth,flow,masks)",
     )
+    parser.add_argument("--viewer", metavar="NAME", help="watch the run: meshcat, in the browser")
+    _add_server(parser)
     _add_maps(parser)
     _add_settings(parser)
     _add_output(parser)
@@ -286,6 +298,26 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--views", nargs="+", choices=VIEWS, default=list(VIEWS), metavar="VIEW")
     parser.add_argument("--background", choices=("white", "black"), default="white")
+
+
+def _add_view(parser: argparse.ArgumentParser) -> None:
+    _add_result(parser)
+    _add_server(parser)
+    parser.add_argument(
+        "--export", metavar="FILE", help="write one self-contained page instead of serving"
+    )
+
+
+def _add_server(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--host",
+        metavar="ADDRESS",
+        help="where the viewer listens (default: this machine alone; others need its token)",
+    )
+    parser.add_argument(
+        "--port", type=_positive, metavar="N", help="default: the first free one from 7000 on"
+    )
+    parser.add_argument("--no-open", action="store_true", help="start no browser")
 
 
 VIEWS = ("top", "perspective")

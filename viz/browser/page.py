@@ -59,7 +59,7 @@ def _fixed_parts() -> dict[str, str]:
     parts = {f"icon_{name}": _icon(name, shape) for name, shape in _ICONS.items()}
     parts["style"] = _read("page.css")
     parts["player"] = "\n".join(_read(f"{name}.js") for name in _SCRIPTS)
-    parts["layers"] = "\n      ".join(_layer(name) for name in _LAYERS)
+    parts["layers"] = "\n    ".join(_layer(name) for name in _LAYERS)
     parts["meshcat"] = _meshcat_viewer()
     return parts
 

@@ -59,7 +59,7 @@ def embed_pictures(paths: Sequence[Path | None], max_bytes: float) -> list[str |
     kept = there[:: max(1, int(np.ceil(needed / max_bytes)))]
     with ThreadPoolExecutor(thread_name_prefix="jpeg") as pool:
         answers = pool.map(lambda k: read_jpeg(Path(str(paths[k])), width, quality), kept)
-        left = max_bytes
+        left = max_bytes - 8 * len(paths)  # of quotes, commas, nulls
         for k, data in zip(kept, answers, strict=True):
             if data is None:
                 continue

@@ -9,7 +9,6 @@ import base64
 from pathlib import Path
 from typing import Any
 
-from pipelines.errors import DyObError
 from pipelines.io.files import write_text
 from pipelines.io.result import Result
 from viz.browser.cloud import MAX_POINTS, Cloud, build_cloud
@@ -26,25 +25,21 @@ _SHARE_OF_POINTS = 0.3  # of the page, at most
 def scene_html(
     result: Result, *, images: bool = True, max_mb: float = 10.0, theme: str = "dark"
 ) -> str:
-    """The run as one page of at most `max_mb` million bytes: scene, time slider and pictures.
+    """The run as one page of about `max_mb` million bytes at most: scene, time slider, pictures.
 
     It holds all that it needs and asks for nothing from outside. images: whether the annotated
-    frames are in it. theme: "dark" or "light". Raises DyObError where the page without pictures is
-    larger than that, ValueError for an unknown theme.
+    frames are in it. Pictures and points are fitted to the size; frames are never left out, so that
+    a run of thousands may take more. theme: "dark" or "light"; ValueError for another.
     """
     playback = build_playback(result)
     most = int(_SHARE_OF_POINTS * max_mb * MB / _BYTES_A_POINT)
     data, cloud = page_data(result, playback, theme=theme, max_points=min(most, MAX_POINTS))
     encoded = base64.b64encode(cloud.message).decode("ascii")
-    bare = embedded_page(data | {"pictures": []}, encoded, theme)
-    left = max_mb * MB - len(bare.encode()) - 8 * len(playback)
-    if left < 0:
-        raise DyObError(
-            f"expected a page of {max_mb:g} MB, found {len(bare) / MB:.1f} MB without pictures; "
-            "allow more"
-        )
-    pictures = embed_pictures(playback.pictures, left) if images else []
-    return embedded_page(data | {"pictures": pictures}, encoded, theme)
+    data["pictures"] = []
+    if images:
+        bare = len(embedded_page(data, encoded, theme).encode())
+        data["pictures"] = embed_pictures(playback.pictures, max_mb * MB - bare)
+    return embedded_page(data, encoded, theme)
 
 
 def export_scene(
@@ -70,5 +65,3 @@ def page_data(
         "frames": playback_records(playback),
     }
     return data, cloud
-
-

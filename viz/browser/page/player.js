@@ -171,7 +171,7 @@ class Player {
     figure.hidden = !address || !this.world.layers.image;
     byId("layer-image").hidden = !address;
     if (address && byId("frame").getAttribute("src") !== address) byId("frame").src = address;
-    const late = address && k !== this.k;
+    const late = address && this.k - k > 2;
     byId("caption").textContent = late ? `picture of frame ${this.frames.list[k].index}` : "";
     if (had !== figure.hidden) this.layout();
   }

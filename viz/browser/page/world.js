@@ -84,13 +84,12 @@ class World {
 
   setMap(bytes, facts) {
     this.facts = facts;
-    if (bytes) this.viewer.handle_command_bytearray(bytes);
-    const cloud = this.viewer.scene_tree.find(["dyob", "map", "<object>"]).object;
-    if (cloud.isPoints) {
-      cloud.material = this.points;
-      cloud.frustumCulled = false;
-      cloud.castShadow = cloud.receiveShadow = false;
-    }
+    if (this.cloud) this.cloud.material = null; // meshcat disposes of what it replaces
+    this.viewer.handle_command_bytearray(bytes);
+    this.cloud = this.viewer.scene_tree.find(["dyob", "map", "<object>"]).object;
+    this.cloud.material = this.points;
+    this.cloud.frustumCulled = false;
+    this.cloud.castShadow = this.cloud.receiveShadow = false;
     this.points.uniforms.radius.value = 0.0045 * facts.scale_m;
     this.drawFrustum();
     this.drawGrid();
