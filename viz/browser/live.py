@@ -29,7 +29,8 @@ from viz.overlay import draw_frame
 WAITING = 4  # frames that wait with their images
 MAP_EVERY_S = 1.0
 MAX_LIVE_POINTS = 60_000  # as the map is sent anew each time
-_UP = np.array([0.0, -1.0, 0.0])  # of the first camera, whose axes the world has
+# Up and forward of the first camera, whose axes the world has.
+_AXES = (np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
 logger = logging.getLogger("dyob.viz")
 
 
@@ -148,7 +149,7 @@ class LiveViewer:
         if self._have_moved or self._map.changed:
             Ts = self._frames.Ts_world_camera
             points, colors = self._map.cloud(Ts)
-            self._server.tell_map(build_cloud(points, colors, Ts[:, :3, 3], _UP, MAX_LIVE_POINTS))
+            self._server.tell_map(build_cloud(points, colors, Ts[:, :3, 3], _AXES, MAX_LIVE_POINTS))
         self._have_moved = False
         self._map_due_s = time.monotonic() + MAP_EVERY_S
 

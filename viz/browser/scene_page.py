@@ -56,7 +56,8 @@ def page_data(
 ) -> tuple[dict[str, Any], Cloud]:
     """What both pages show, but for the pictures: setup, frames and facts of the map; the map."""
     scene = playback.scene
-    cloud = build_cloud(scene.points_m, scene.colors, scene.path_m, scene.up, max_points)
+    axes = (scene.up, scene.forward)
+    cloud = build_cloud(scene.points_m, scene.colors, scene.path_m, axes, max_points)
     title = str(result.metrics.get("run", {}).get("sequence", result.folder.name))
     notes = ["the map is thinned"] if cloud.n_points < cloud.n_all else []
     data = {

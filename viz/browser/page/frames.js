@@ -85,8 +85,9 @@ class Frames {
     return values;
   }
 
-  // The frame that shows most: where most objects move.
+  // The frame that shows most: where most objects move, or the last one where nothing does.
   poster() {
+    if (!this.moved.size) return this.length - 1;
     const moving = this.list.map(
       (frame) => [...frame.boxes.values()].filter((box) => box.state === "moving").length);
     return Math.max(0, moving.indexOf(Math.max(...moving)));

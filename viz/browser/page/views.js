@@ -35,8 +35,8 @@ class Views {
     } else {
       const s = this.world.facts.scale_m;
       this.lens(55);
-      camera.position.set(0, 0.48 * s, 0.8 * s).applyMatrix4(rig);
-      target.set(0, -0.05 * s, -0.75 * s).applyMatrix4(rig);
+      camera.position.set(0, 0.72 * s, 1.2 * s).applyMatrix4(rig);
+      target.set(0, -0.08 * s, -1.15 * s).applyMatrix4(rig);
     }
     this.rig = rig;
     this.viewer.set_dirty();
@@ -56,15 +56,18 @@ class Views {
     return turn.setPosition(this.world.toThree(camera.p));
   }
 
-  // All that the camera and moving objects pass, in three's coordinates.
+  // What the camera and moving objects pass and most of the map, in three's coordinates.
   span() {
     const { THREE } = MeshCat, box = new THREE.Box3();
     for (const { p } of this.frames.list) box.expandByPoint(this.world.toThree(p));
     for (const id of this.frames.moved) {
       for (const { p } of this.frames.paths.get(id)) box.expandByPoint(this.world.toThree(p));
     }
+    for (const [right, forward, up] of this.world.facts.extent_m) {
+      box.expandByPoint(new THREE.Vector3(right, up, -forward));
+    }
     if (box.isEmpty()) box.expandByPoint(new THREE.Vector3());
-    return box.expandByScalar(0.35 * this.world.facts.scale_m);
+    return box.expandByScalar(0.3 * this.world.facts.scale_m);
   }
 
   top() {
@@ -94,7 +97,8 @@ class Views {
     box.getCenter(controls.target);
     const away = new MeshCat.THREE.Vector3(-0.55, 0.62, 0.75).normalize();
     const fit = Math.min(1, camera.aspect / 1.5);
-    camera.position.copy(controls.target).addScaledVector(away, (1.3 * radius) / fit);
+    controls.target.y -= 0.12 * radius; // the controls take the lowest part of the screen
+    camera.position.copy(controls.target).addScaledVector(away, (1.35 * radius) / fit);
     this.viewer.set_dirty();
   }
 

@@ -40,7 +40,7 @@ class World {
     this.frames = frames;
     this.boxes = new Map();
     this.trails = new Map();
-    this.facts = { scale_m: 10, ground_m: 0 };
+    this.facts = { scale_m: 10, ground_m: -1.5, extent_m: [] };
     this.layers = { map: true, camera: true, objects: true, trails: true, truth: true };
     viewer.gui.domElement.style.display = "none";
     for (const name of ["Axes", "Grid"]) viewer.set_property([name], "visible", false);
@@ -90,7 +90,7 @@ class World {
     this.cloud.material = this.points;
     this.cloud.frustumCulled = false;
     this.cloud.castShadow = this.cloud.receiveShadow = false;
-    this.points.uniforms.radius.value = 0.0045 * facts.scale_m;
+    this.points.uniforms.radius.value = 0.0068 * facts.scale_m;
     this.drawFrustum();
     this.drawGrid();
     this.show();
@@ -109,7 +109,7 @@ class World {
   }
 
   drawFrustum() {
-    const { left, right, top, bottom } = this.aperture, z = 0.12 * this.facts.scale_m;
+    const { left, right, top, bottom } = this.aperture, z = 0.19 * this.facts.scale_m;
     const at = (x, y) => [x * z, y * z, z];
     const corners = [at(left, top), at(right, top), at(right, bottom), at(left, bottom)];
     const values = [];
@@ -140,7 +140,7 @@ class World {
   }
 
   gridSpan() {
-    const { right, forward } = this.axes, margin = 2.5 * this.facts.scale_m;
+    const { right, forward } = this.axes, margin = 4 * this.facts.scale_m;
     const low = { x: Infinity, z: Infinity }, high = { x: -Infinity, z: -Infinity };
     for (const { p } of this.frames.list) {
       for (const [axis, value] of [["x", p.dot(right)], ["z", p.dot(forward)]]) {
