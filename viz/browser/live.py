@@ -1,16 +1,19 @@
 """The browser viewer of a run that goes on: a sink with a thread of its own.
 
 Owns what is shown of a frame, and what is left out when the view lags behind: pictures, never
-frames, and nothing of the run. The run hands each frame over and goes on at once.
+frames, and nothing of the run. The run hands each frame over and goes on at once. Pictures are
+drawn in a process of their own, as Python runs one thread at a time.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.backend.worker import ProcessWorker, WorkerDied
 from pipelines.types import Array, Frame, FrameResult
 from viz.browser.cloud import build_cloud
 from viz.browser.live_map import LiveFrame, LiveFrames, LiveMap
@@ -28,6 +32,7 @@ from viz.overlay import draw_frame
 
 WAITING = 4  # frames that wait with their images
 MAP_EVERY_S = 1.0
+NICE = 10  # what the process of the pictures lets go before it
 MAX_LIVE_POINTS = 60_000  # as the map is sent anew each time
 # Up and forward of the first camera, whose axes the world has.
 _AXES = (np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
@@ -76,6 +81,8 @@ class LiveViewer:
         self._frames = LiveFrames()
         self._map = LiveMap(config.mapping.min_observations)
         self._have_moved, self._map_due_s = False, 0.0
+        self._painter = ProcessWorker()
+        self._painter.submit(os.nice, NICE)
         self._server.start()
         self._thread = threading.Thread(target=self._show_all, name="live-viewer", daemon=True)
         self._thread.start()
@@ -104,6 +111,7 @@ class LiveViewer:
             self._has_come.notify()
         self._thread.join()
         self._thread = None
+        self._painter.close()
         self._server.stop()
 
     def _drop_the_late(self) -> None:
@@ -141,7 +149,9 @@ class LiveViewer:
             return
         if result.observations is not None:
             self._map.add(result.observations, self._frames, frame.image)
-        self._server.tell_picture(k, encode_jpeg(draw_frame(frame, result), *LIVE))
+        bare = replace(result, observations=None)
+        with suppress(WorkerDied):  # it is started anew for the next one
+            self._server.tell_picture(k, self._painter.submit(draw_jpeg, frame, bare).result())
 
     def _show_map(self) -> None:
         if self._have_moved:
@@ -152,6 +162,11 @@ class LiveViewer:
             self._server.tell_map(build_cloud(points, colors, Ts[:, :3, 3], _AXES, MAX_LIVE_POINTS))
         self._have_moved = False
         self._map_due_s = time.monotonic() + MAP_EVERY_S
+
+
+def draw_jpeg(frame: Frame, result: FrameResult) -> bytes:
+    """The annotated frame as JPEG."""
+    return encode_jpeg(draw_frame(frame, result), *LIVE)
 
 
 def _record(frame: LiveFrame) -> dict[str, Any]:
