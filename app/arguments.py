@@ -30,6 +30,8 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--stride", type=_positive, default=1, metavar="S", help="every S-th frame")
     parser.add_argument("--seed", type=_not_negative, metavar="N", help="of all random choices")
     _add_simulation(parser)
+    parser.add_argument("--viewer", metavar="NAME", help="watch the run: meshcat, in the browser")
+    _add_server(parser)
     _add_maps(parser)
     _add_settings(parser)
     _add_output(parser)
@@ -106,6 +108,26 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--views", nargs="+", choices=VIEWS, default=list(VIEWS), metavar="VIEW")
     parser.add_argument("--background", choices=("white", "black"), default="white")
+
+
+def _add_view(parser: argparse.ArgumentParser) -> None:
+    _add_result(parser)
+    _add_server(parser)
+    parser.add_argument(
+        "--export", metavar="FILE", help="write one self-contained page instead of serving"
+    )
+
+
+def _add_server(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--host",
+        metavar="ADDRESS",
+        help="where the viewer listens (default: this machine alone; others need its token)",
+    )
+    parser.add_argument(
+        "--port", type=_positive, metavar="N", help="default: the first free one from 7000 on"
+    )
+    parser.add_argument("--no-open", action="store_true", help="start no browser")
 
 
 def _add_prepare(parser: argparse.ArgumentParser) -> None:
@@ -253,6 +275,7 @@ ADDERS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     "eval": _add_result,
     "optimize": _add_optimize,
     "render": _add_render,
+    "view": _add_view,
     "bench": _add_bench,
     "prepare": _add_prepare,
     "doctor": _add_doctor,

@@ -43,6 +43,7 @@ run DATA                        # the layout is guessed from the folder
 run DATA --dataset tum_rgbd --frames 100 --stride 2
 run simulated:street --degrade --seed 7
 run DATA --set orb.n_features=1500 --output my_result
+run DATA --viewer meshcat       # watch it in the browser
 run DATA --save-map my_map      # and later, where the map is known:
 run DATA --load-map my_map --localize""",
     ),
@@ -67,6 +68,14 @@ optimize RESULT --set batch.method=partial""",
         """\
 render                          # the latest result
 render RESULT --size 1920x1080 --views top""",
+    ),
+    "view": Verb(
+        "app.viewing:view",
+        "show a result folder in the browser, with a time slider",
+        """\
+view                            # the latest result, on this machine alone
+view RESULT --export my_scene.html
+view RESULT --host 0.0.0.0      # for others, who need the token in its address""",
     ),
     "bench": Verb(
         "app.bench:bench",

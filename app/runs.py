@@ -10,7 +10,7 @@ from argparse import Namespace
 from contextlib import suppress
 from typing import Any
 
-from app import bootstrap, console
+from app import bootstrap, console, viewing
 from pipelines.errors import ConfigError, DyObError
 
 SIMULATED = "simulated"
@@ -24,6 +24,7 @@ def run(arguments: Namespace) -> int:
     from pipelines.datasets import open_sequence
     from pipelines.lasting_map import LastingMap
 
+    viewer = viewing.live_viewer(arguments)
     maps = LastingMap(arguments.load_map, arguments.save_map, arguments.localize)
     overrides = list(arguments.overrides)
     if arguments.seed is not None:
@@ -38,12 +39,18 @@ def run(arguments: Namespace) -> int:
             options["progress"] = progress
         sequence = open_sequence(arguments.path, arguments.dataset, arguments.sequence, **options)
     span = {"start": arguments.start, "frames": arguments.frames, "stride": arguments.stride}
-    result = _process(sequence, config, arguments, span, lasting_map=maps)
+    result = _process(sequence, config, arguments, span, viewer=viewer, lasting_map=maps)
     folder = console.shorten(result.folder)
     if arguments.quiet:
         console.say(folder)
     else:
-        console.next_steps({"pictures": f"render {folder}", "errors again": f"eval {folder}"})
+        console.next_steps(
+            {
+                "in the browser": f"view {folder}",
+                "pictures": f"render {folder}",
+                "errors again": f"eval {folder}",
+            }
+        )
     return _code(result)
 
 
@@ -51,6 +58,8 @@ def demo(arguments: Namespace) -> int:
     """`demo`: a small simulated sequence, its result, its pictures, and what to do next."""
     from pipelines.config import load_config
     from pipelines.datasets import open_sequence
+    from pipelines.io import folder as names
+    from viz.browser import export_scene
     from viz.plots import plot_result
     from viz.render import render_result
 
@@ -63,12 +72,14 @@ def demo(arguments: Namespace) -> int:
         return INTERRUPTED
     with console.warnings(), console.working("drawing the map and the trajectory", quiet):
         pictures = render_result(result.folder) + plot_result(result.folder)
+        pictures.append(export_scene(result, result.folder / names.SCENE))
     console.pictures(pictures)
     if not quiet:
         if arguments.pictures:
             console.say(f"{console.shorten(result.folder / 'frames')}/ with each frame annotated")
         console.next_steps(
             {
+                "in the browser": f"view {console.shorten(result.folder)}",
                 "your own data": "run PATH",
                 "is it fit?": "doctor PATH",
                 "layouts": "datasets",
@@ -110,8 +121,11 @@ def optimize(arguments: Namespace) -> int:
 
 
 def render(arguments: Namespace) -> int:
-    """`render RESULT`: PNG files in the result folder."""
+    """`render RESULT`: PNG files in the result folder, and the scene as a page."""
+    from pipelines.io import folder as names
     from pipelines.io.folder import open_result_folder
+    from pipelines.io.result import load_result
+    from viz.browser import export_scene
     from viz.plots import plot_result
     from viz.render import render_result
 
@@ -124,6 +138,7 @@ def render(arguments: Namespace) -> int:
             background=arguments.background,
         )
         pictures += plot_result(folder)
+        pictures.append(export_scene(load_result(folder), folder / names.SCENE))
     console.pictures(pictures)
     return 0
 
@@ -140,7 +155,13 @@ def keep_freed_memory() -> None:
 
 
 def _process(
-    sequence: Any, config: Any, arguments: Namespace, span: dict[str, Any], **more: Any
+    sequence: Any,
+    config: Any,
+    arguments: Namespace,
+    span: dict[str, Any],
+    *,
+    viewer: Any = None,
+    **more: Any,
 ) -> Any:
     from pipelines.runner import run as run_sequence
     from viz.overlay import FrameWriter
@@ -149,6 +170,8 @@ def _process(
     sinks: list[Any] = [] if arguments.quiet else [console.Progress()]
     if arguments.pictures:
         sinks.append(FrameWriter(every=arguments.pictures))
+    if viewer is not None:
+        sinks.append(viewer)
     with console.warnings(), console.counting("optimising", arguments.quiet) as optimising:
         result = run_sequence(
             sequence,

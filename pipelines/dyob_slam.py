@@ -175,6 +175,17 @@ class DyObSlam:
         """The sparse static map as it stands, copied."""
         return self.map.snapshot()
 
+    @property
+    def n_corrections(self) -> int:
+        """How often the back-end has moved the map so far."""
+        return self._backend.n_applied
+
+    def keyframe_poses(self) -> tuple[NDArray[np.int64], Array]:
+        """Frame indices (K,) and T_world_camera (K, 4, 4) of all keyframes, as they are now."""
+        keyframes = self.map.keyframes
+        Ts = np.array([k.T_world_camera for k in keyframes]).reshape(-1, 4, 4)
+        return np.array([k.frame_index for k in keyframes], np.int64), Ts
+
     def revise(self, results: Sequence[FrameResult]) -> list[FrameResult]:
         """Results of `process`, in their order, as the map's corrections since then have them."""
         if not self._backend.n_applied:

@@ -12,7 +12,10 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.config import Config, config_to_dict
 from pipelines.datasets.sequence import Sequence
@@ -31,7 +34,7 @@ from pipelines.io.result import (
     run_metrics,
 )
 from pipelines.lasting_map import LastingMap, note_end, note_start
-from pipelines.types import Frame, FrameResult
+from pipelines.types import Array, Frame, FrameResult
 
 RESULTS = "results"  # folder that result folders go to, below the working folder
 _log = logging.getLogger("dyob.run")
@@ -48,6 +51,17 @@ class Sink(Protocol):
 
     def finish(self) -> None:
         """After the last frame, and whatever ended the run; the files are not written yet."""
+
+
+@runtime_checkable
+class KeyframeSink(Sink, Protocol):
+    """A sink that also wants to know where the back-end moves the past."""
+
+    def keyframes(self, frame_index: NDArray[np.int64], Ts_world_camera: Array) -> None:
+        """All keyframes (K,) where they are now, (K, 4, 4), before the next `frame`.
+
+        They come when some have moved, and may already hold that next frame.
+        """
 
 
 @dataclass(slots=True)
@@ -165,7 +179,7 @@ def _process_all(
     sinks: tuple[Sink, ...],
     progress: _Progress,
 ) -> None:
-    begin = time.perf_counter()
+    begin, n_corrections = time.perf_counter(), 0
     for index, pending in _prepare_ahead(sequence, slam, indices):
         try:
             prepared = pending.result()
@@ -191,6 +205,11 @@ def _process_all(
             ", keyframe" if result.is_keyframe else "",
             result.timings_ms["wall"],
         )
+        if slam.n_corrections > n_corrections:
+            n_corrections = slam.n_corrections
+            for sink in sinks:
+                if isinstance(sink, KeyframeSink):
+                    sink.keyframes(*slam.keyframe_poses())
         for sink in sinks:
             sink.frame(prepared.frame, result)
 

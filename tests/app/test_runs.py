@@ -39,7 +39,15 @@ def calls(monkeypatch, tmp_path) -> dict[str, Any]:
     def plot_result(folder):
         return [Path(folder) / "plots" / "trajectory.png"]
 
-    stand_ins = {"pipelines.runner": run, "viz.render": render_result, "viz.plots": plot_result}
+    def export_scene(result, path):
+        return Path(path)
+
+    stand_ins = {
+        "pipelines.runner": run,
+        "viz.render": render_result,
+        "viz.plots": plot_result,
+        "viz.browser": export_scene,
+    }
     for name, function in stand_ins.items():
         module = ModuleType(name)
         setattr(module, function.__name__, function)

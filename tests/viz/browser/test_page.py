@@ -1,0 +1,269 @@
+"""The pages in a real browser: they open in peace, the slider moves objects, nothing leaks out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from app.system_libraries import browser as find_browser
+from pipelines.config import Config
+from pipelines.types import Frame, FrameResult, MotionHypothesis, TrackingStatus
+from viz.browser import export_scene
+from viz.browser.live import LiveViewer
+from viz.browser.recorded import RecordedServer
+
+FLAGS = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+SIZE = {"width": 900, "height": 560}
+WAIT_S = 40.0
+
+
+class Visit:
+    """A page in the browser, what it complained of, and what it asked for."""
+
+    def __init__(self, browser: Any, address: str) -> None:
+        self.context = browser.new_context(viewport=SIZE)
+        self.page = self.context.new_page()
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+        self.page.on("console", self._heard)
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("websocket", lambda socket: self.requests.append(socket.url))
+        self.context.route("**/*", self._asked)
+        self.page.goto(address)
+        self.until("!!(window.dyob && dyob.ready)")
+
+    def _heard(self, message: Any) -> None:
+        # Drivers in software tell how slow they are.
+        if message.type in ("error", "warning") and "GPU stall" not in message.text:
+            self.complaints.append(message.text)
+
+    def _asked(self, route: Any) -> None:
+        self.requests.append(route.request.url)
+        route.continue_()
+
+    def ask(self, script: str) -> Any:
+        return self.page.evaluate(script)
+
+    def until(self, condition: str) -> None:
+        deadline = time.monotonic() + WAIT_S
+        while not self.ask(condition):  # the page's policy forbids playwright's own waiting
+            assert time.monotonic() < deadline, f"{condition}: {self.complaints}"
+            self.page.wait_for_timeout(50)
+
+    def picture(self) -> np.ndarray:
+        self.page.wait_for_timeout(250)
+        return cv2.imdecode(np.frombuffer(self.page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+
+    def box(self, object_id: int) -> dict[str, Any]:
+        (found,) = [box for box in self.ask("dyob.boxes()") if box["id"] == object_id]
+        return found
+
+    def slide_to(self, k: int) -> None:
+        """As a person does: the slider's own event."""
+        self.ask(
+            f"(() => {{ const s = document.getElementById('slider'); s.value = {k}; "
+            "s.dispatchEvent(new Event('input')); })()"
+        )
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium without a display. For this module alone: playwright's loop would disturb others."""
+    program = find_browser()
+    if program is None:
+        pytest.skip("needs chromium, which is not there: apt-get install chromium")
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    with playwright.sync_playwright() as running:
+        browser = running.chromium.launch(executable_path=program, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def scene(browser, result, tmp_path_factory) -> Iterator[Visit]:
+    path = export_scene(result, tmp_path_factory.mktemp("page") / "scene.html")
+    visit = Visit(browser, path.as_uri())
+    yield visit
+    visit.context.close()
+
+
+def around(picture: np.ndarray, pixel: list[float]) -> np.ndarray:
+    u, v = round(pixel[0]), round(pixel[1])
+    return picture[max(v - 15, 0) : v + 15, max(u - 20, 0) : u + 20].astype(float)
+
+
+def test_the_page_alone_shows_the_run_and_asks_for_nothing(scene):
+    assert scene.ask("dyob.length") == 8
+    assert scene.ask("document.title") == "a <b>road</b> - DyOb-SLAM"
+    assert scene.ask("document.getElementById('points').textContent") == "600 points"
+    assert {box["id"] for box in scene.ask("dyob.boxes()")} == {3, 5}
+    assert scene.picture().std() > 5
+    assert all(url.startswith(("file:", "data:")) for url in scene.requests)
+    assert scene.complaints == []
+
+
+def test_the_slider_moves_the_objects(scene, objects):
+    scene.ask("dyob.view('top')")
+    scene.slide_to(1)
+    before, first = scene.box(3), scene.picture()
+    scene.slide_to(7)
+    after, second = scene.box(3), scene.picture()
+    centers = objects.centers_m[objects.object_id == 3]
+    np.testing.assert_allclose(before["position"], centers[1], atol=2e-3)
+    np.testing.assert_allclose(after["position"], centers[7], atol=2e-3)
+    for place in (before["pixel"], after["pixel"]):
+        assert np.abs(around(first, place) - around(second, place)).mean() > 10
+    parked = scene.box(5)
+    np.testing.assert_allclose(parked["position"], [-3, 0.8, 8], atol=2e-3)
+    assert scene.ask("document.getElementById('count').textContent") == "frame 7"
+    assert scene.complaints == []
+
+
+def test_up_is_up_and_right_is_right(scene):
+    scene.ask("dyob.view('follow')")
+    scene.ask("dyob.seek(0)")
+    moving, parked = scene.box(3)["pixel"], scene.box(5)["pixel"]
+    assert parked[0] < 450 < moving[0]
+    camera = scene.ask("dyob.player.viewer.camera.position.toArray()")
+    assert camera[1] > 1.0  # three's up: the view is from above the car's camera, and from behind
+    assert camera[2] > 1.0
+    label, other = scene.ask("dyob.labels()")
+    assert label["words"] == "3 car 29 km/h" and other["words"] == "5 car stopped"
+    assert label["bottom"] < moving[1]
+
+
+def test_layers_are_hidden_and_shown(scene):
+    scene.ask("dyob.view('top')")
+    scene.slide_to(3)
+    whole = scene.picture()
+    for layer in ("objects", "trails", "camera", "labels", "image"):
+        scene.page.click(f"#show-{layer}")
+        less = scene.picture()
+        assert np.abs(whole.astype(float) - less).max() > 60, layer
+        scene.page.click(f"#show-{layer}")
+    assert np.abs(whole.astype(float) - scene.picture()).mean() < 0.5
+
+
+def test_keys_step_and_play_goes_on_by_itself(scene):
+    scene.slide_to(2)
+    scene.page.keyboard.press("ArrowRight")
+    assert scene.ask("dyob.frame") == 3
+    scene.page.keyboard.press("ArrowLeft")
+    scene.page.keyboard.press("ArrowLeft")
+    assert scene.ask("dyob.frame") == 1
+    scene.page.keyboard.press("2")
+    assert scene.ask("dyob.player.views.mode") == "top"
+    scene.page.keyboard.press("Space")
+    scene.until("dyob.frame === 7 && !dyob.player.playing")
+    scene.page.keyboard.press("t")
+    scene.page.keyboard.press("i")
+    assert scene.ask("document.body.dataset.theme") == "light"
+    assert scene.complaints == []
+
+
+def test_a_result_is_seen_through_its_server(browser, result, capfd):
+    server = RecordedServer(result, host="0.0.0.0")
+    server.start()
+    own = f"http://127.0.0.1:{server.port}/"
+    try:
+        visit = Visit(browser, f"{own}?token={server.token}")
+        visit.slide_to(6)
+        assert visit.box(3)["position"][2] > 13
+        visit.until("document.getElementById('frame').naturalWidth === 320")
+        assert all(url.startswith((own, "data:")) for url in visit.requests)
+        assert any("picture/6" in url for url in visit.requests)
+        assert visit.complaints == []
+        visit.context.close()
+    finally:
+        server.stop()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def live_frames(objects, n: int) -> Iterator[tuple[Frame, FrameResult]]:
+    for k in range(n):
+        frame = Frame(k, 0.1 * k, np.full((120, 320, 3), 40 + 20 * k, np.uint8))
+        T = np.eye(4)
+        T[2, 3] = 0.4 * k
+        yield (
+            frame,
+            FrameResult(
+                k, 0.1 * k, TrackingStatus.OK, T, np.zeros((6, 6)),
+                MotionHypothesis.CONSTANT_VELOCITY, k == 0, np.empty((0, 2)),
+                np.empty(0, np.int64), np.empty(0, bool), 0.1,
+                objects[objects.frame_index == k],
+                np.zeros((120, 320), np.int32),
+            ),
+        )  # fmt: skip
+
+
+def test_a_live_run_is_seen_and_stays_when_it_is_over(browser, objects, tmp_path, capfd):
+    urls: list[str] = []
+    viewer = LiveViewer(announce=urls.append)
+    camera = SimpleNamespace(cx=160, cy=60, fx=200, fy=200, width=320, height=120)
+    sequence = SimpleNamespace(name="under way", camera=camera)
+    viewer.start(sequence, 8, Config(), tmp_path)
+    frames = list(live_frames(objects, 8))
+    for item in frames[:3]:
+        viewer.frame(*item)
+    early, gone = Visit(browser, urls[0]), Visit(browser, urls[0])
+    early.until("dyob.length === 3 && dyob.frame === 2")
+    gone.context.close()  # a closed browser is no matter for the run
+    for item in frames[3:]:
+        viewer.frame(*item)
+        early.page.wait_for_timeout(20)
+    early.until("dyob.length === 8 && dyob.frame === 7")
+    assert early.box(3)["position"][2] > 14
+    late = Visit(browser, urls[0])
+    assert late.ask("dyob.length") == 8
+    early.until("!!dyob.player.source.picture(7)")
+    viewer.finish()
+    for visit in (early, late):
+        visit.until("dyob.player.isOver")
+        visit.slide_to(0)
+        assert visit.box(3)["position"][2] == pytest.approx(9.0, abs=2e-3)
+        own = urls[0].split("://")[1]
+        assert all(url.split("://")[1].startswith(own) for url in visit.requests if "://" in url)
+        assert visit.complaints == []
+        visit.context.close()
+    said = capfd.readouterr().err
+    assert "Traceback" not in said and "never retrieved" not in said
+
+
+def test_the_page_lives_in_a_frame_of_a_notebook(browser, result, tmp_path: Path):
+    from html import escape
+
+    from viz.browser import scene_html
+
+    inner = escape(scene_html(result, images=False), quote=True)
+    outer = f'<iframe srcdoc="{inner}" style="width:900px;height:540px;border:0"></iframe>'
+    (tmp_path / "outer.html").write_text(f"<!DOCTYPE html><body>{outer}", encoding="utf-8")
+    context = browser.new_context(viewport=SIZE)
+    page = context.new_page()
+    complaints: list[str] = []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto((tmp_path / "outer.html").as_uri())
+    deadline = time.monotonic() + WAIT_S
+    while not (len(page.frames) > 1 and page.frames[1].evaluate("!!(window.dyob && dyob.ready)")):
+        assert time.monotonic() < deadline, complaints
+        page.wait_for_timeout(50)
+    assert page.frames[1].evaluate("dyob.boxes().length") == 2
+    assert complaints == []
+    context.close()
+    assert (tmp_path / "outer.html").stat().st_size < 3e6
