@@ -46,6 +46,8 @@ class View:
     """A pinhole view of the scene: axes of the view as a camera's, size in pixels (width, height).
 
     px_per_m: scale of a map seen from above, or None where the scale varies with distance.
+    near_m: points nearer than this are left out. haze: depths at which points begin to turn to the
+    colour of the ground and at which they have done so, and how far they do (0 to 1), or None.
     """
 
     name: str
@@ -53,6 +55,8 @@ class View:
     K: Array
     T_view_world: Array
     px_per_m: float | None = None
+    near_m: float = 1e-3
+    haze: tuple[float, float, float] | None = None
 
     def project(self, points_m: Array) -> tuple[Array, Array]:
         """Pixels (N, 2) and depths (N,) in metres of world points (N, 3)."""
@@ -98,9 +102,14 @@ def near_path(points_m: Array, path_m: Array) -> NDArray[np.bool_]:
     return distance <= STRAY_FACTOR * np.quantile(distance[finite], STRAY_QUANTILE)
 
 
-def frustums(Ts_world_camera: Array, size_m: float) -> list[Array]:
-    """Closed outlines (K of (8, 3)) of small pyramids that open the way the cameras look."""
-    x, y, z = 0.62 * size_m, 0.4 * size_m, size_m
+def frustums(
+    Ts_world_camera: Array, size_m: float, opening: tuple[float, float] = (0.62, 0.4)
+) -> list[Array]:
+    """Closed outlines (K of (10, 3)) of small pyramids that open the way the cameras look.
+
+    opening: half of the width and of the height of a picture at distance 1.
+    """
+    x, y, z = opening[0] * size_m, opening[1] * size_m, size_m
     corners = np.array([[-x, -y, z], [x, -y, z], [x, y, z], [-x, y, z]])
     apex = np.zeros(3)
     order = [apex, *corners, corners[0], apex, corners[1], corners[2], apex, corners[3]]

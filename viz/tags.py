@@ -5,14 +5,17 @@ Owns their drawing. Knows no object: a tag is a point, words and a colour.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from pipelines.types import Image
 from viz import style
 from viz.object_marks import Box, overlaps
-from viz.scene import Scene, View
+from viz.object_paths import Tag
+from viz.scene import View
 
 
 def draw_tags(
-    picture: Image, view: View, scene: Scene, taken: list[Box], *, dark: bool = False
+    picture: Image, view: View, tags: Sequence[Tag], taken: list[Box], *, dark: bool = False
 ) -> None:
     """A disc at the end of each moving object's path and its words beside it, in place.
 
@@ -26,7 +29,7 @@ def draw_tags(
     radius = max(3, round(0.34 * text_px))
     ink, panel = (style.WHITE, style.BACKGROUNDS["black"]) if dark else (style.INK, style.WHITE)
     taken, seen = list(taken), []
-    for tag in scene.tags:
+    for tag in tags:
         uv, depth = view.project(tag.point_m[None])
         if depth[0] <= 0 or not (0 <= uv[0, 0] < W and 0 <= uv[0, 1] < H):
             continue
