@@ -26,24 +26,28 @@ STILL_WIDTH_PX = 1.0
 
 
 def draw_boxes(
-    picture: Image,
-    view: View,
-    boxes: Sequence[ObjectBox],
-    taken: list[Box],
-    *,
-    text_px: int,
-    dark: bool = False,
+    picture: Image, view: View, boxes: Sequence[ObjectBox], *, dark: bool = False
 ) -> None:
-    """Boxes from far to near, then labels, in place; `taken` is what labels must leave free."""
-    shown = [box for box in boxes if (view.project(box.corners_m)[1] > NEAR_M).all()]
-    shown = [box for box in shown if _outline(view, box) is not None]
-    depth = {id(b): float(view.project(b.T_world_box[None, :3, 3])[1][0]) for b in shown}
-    for box in sorted(shown, key=lambda b: -depth[id(b)]):
+    """The boxes that are in the picture, from far to near, in place."""
+    for box in reversed(_shown(view, boxes)):
         _draw_box(picture, view, box, dark)
+
+
+def draw_box_labels(
+    picture: Image, view: View, boxes: Sequence[ObjectBox], taken: list[Box], text_px: int
+) -> None:
+    """Words above the boxes, in place, those of what moves first; `taken` stays free of them."""
     rank = {str(state): n for n, state in enumerate(ORDER)}
     taken = list(taken)
-    for box in sorted(shown, key=lambda b: (rank[b.state], depth[id(b)])):
+    for box in sorted(_shown(view, boxes), key=lambda b: rank[b.state]):
         _draw_label(picture, view, box, taken, text_px)
+
+
+def _shown(view: View, boxes: Sequence[ObjectBox]) -> list[ObjectBox]:
+    """Those wholly before the view and at least partly in the picture, from near to far."""
+    before = [box for box in boxes if (view.project(box.corners_m)[1] > NEAR_M).all()]
+    shown = [box for box in before if _outline(view, box) is not None]
+    return sorted(shown, key=lambda b: float(view.project(b.T_world_box[None, :3, 3])[1][0]))
 
 
 def _draw_box(picture: Image, view: View, box: ObjectBox, dark: bool) -> None:
@@ -90,8 +94,8 @@ def _draw_label(picture: Image, view: View, box: ObjectBox, taken: list[Box], te
     left = round((u0 + u1 - w) / 2)
     rows = [v0 - h - 3, v0 - 2 * h - 5, v1 + 3, v0 - 3 * h - 7]
     for top in rows if moves else rows[:1]:
-        for u in (left, u0, u1 - w):
-            u = int(np.clip(u, 0, max(W - w, 0)))
+        for wanted in (left, u0, u1 - w):
+            u = int(np.clip(wanted, 0, max(W - w, 0)))
             place = (u, top, u + w, top + h)
             if top >= 0 and place[3] <= H and not overlaps(place, taken):
                 taken.append(place)

@@ -6,19 +6,18 @@ Owns how far behind they stay and how calmly they follow. Pure geometry, draws n
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from pipelines.geometry import invert_T, transform_points
 from pipelines.object_types import ObjectState
 from pipelines.types import Array
 from viz.playback import Playback
-from viz.scene import Scene, View, extent_m
+from viz.scene import View, extent_m
+from viz.smoothing import smoothed
 from viz.views import look_from, view_axes
 
-BACK, ABOVE, AHEAD = 0.55, 0.36, 0.6  # of the reach: eye behind and above, target ahead
+BACK, ABOVE, AHEAD = 0.42, 0.29, 0.35  # of the reach: eye behind and above, target ahead
 LOWEST_SHARE, HIGHEST_SHARE = 0.03, 0.5  # of the scene's extent: bounds of the reach
 FIELD_OF_VIEW_DEG = 62.0  # across a picture of 16:9; a wider one shows more at its sides
-CALM_S = 0.6  # standard deviation of the smoothing over time
 HAZE = (1.6, 7.0, 0.8)  # depths in reaches, and how far points fade
 NEAR = 0.3  # of the way from the eye to the camera: points before that only hide things
 FAR = 5.0  # in reaches: objects beyond are too small to tell anything
@@ -27,14 +26,12 @@ N_SAMPLES = 15
 
 def chase_views(playback: Playback, size: tuple[int, int]) -> list[View]:
     """A view of (width, height) pixels for each frame, which follows the camera calmly."""
-    scene, n = playback.scene, len(playback)
-    if n == 0:
+    scene = playback.scene
+    if len(playback) == 0:
         return []
-    steps_s = np.diff(playback.timestamps_s)
-    sigma = CALM_S / max(float(np.median(steps_s)), 1e-3) if len(steps_s) else 1.0
     reach_m = view_reach_m(playback)
-    centers = gaussian_filter1d(playback.Ts_world_camera[:, :3, 3], sigma, 0, mode="nearest")
-    headings = _headings(playback.Ts_world_camera, scene, sigma)
+    centers = smoothed(playback.Ts_world_camera[:, :3, 3], playback.timestamps_s)
+    headings = _headings(playback)
     focal = 0.5 * min(size[0], size[1] * 16 / 9) / np.tan(np.radians(FIELD_OF_VIEW_DEG) / 2.0)
     K = np.array([[focal, 0, (size[0] - 1) / 2.0], [0, focal, (size[1] - 1) / 2.0], [0, 0, 1.0]])
     views = []
@@ -51,12 +48,10 @@ def chase_views(playback: Playback, size: tuple[int, int]) -> list[View]:
 
 def view_reach_m(playback: Playback) -> float:
     """How far the camera typically saw points of the map: the measure of all that follows it."""
-    scene = playback.scene
+    scene, last = playback.scene, len(playback) - 1
     extent = extent_m(scene.path_m, scene.points_m)
     medians = []
-    for k in np.linspace(0, max(len(playback) - 1, 0), N_SAMPLES).astype(int).tolist():
-        if not len(playback):
-            break
+    for k in np.linspace(0, last, N_SAMPLES).astype(int).tolist() if last >= 0 else ():
         local = transform_points(invert_T(playback.Ts_world_camera[k]), scene.points_m)
         seen = (local[:, 2] > 0) & (np.abs(local[:, :2]) < [0.8, 0.6] * local[:, 2:]).all(1)
         if seen.any():
@@ -80,15 +75,16 @@ def telling_frame(playback: Playback, views: list[View]) -> int:
     return int(scores.argmax())
 
 
-def _headings(Ts: Array, scene: Scene, sigma: float) -> Array:
+def _headings(playback: Playback) -> Array:
     """Level unit vectors (F, 3) along which the camera looks, smoothed.
 
     One that looks straight down or up has no such direction: the top of its picture then counts.
     """
+    scene, Ts = playback.scene, playback.Ts_world_camera
     ahead, above = Ts[:, :3, 2], -Ts[:, :3, 1]
     tilt = (ahead @ scene.up)[:, None]
     level = ahead - tilt * above
     level = level - (level @ scene.up)[:, None] * scene.up
-    level = gaussian_filter1d(level, sigma, 0, mode="nearest")
+    level = smoothed(level, playback.timestamps_s)
     length = np.linalg.norm(level, axis=1)[:, None]
     return np.where(length > 1e-3, level / np.maximum(length, 1e-9), scene.forward)

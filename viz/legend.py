@@ -16,9 +16,10 @@ from pipelines.object_types import ObjectState
 from pipelines.types import Image
 from viz import style
 from viz.boxes import ObjectBox
+from viz.ground import grid_step_m
 from viz.lines import draw_segment
+from viz.moment import Stage
 from viz.object_marks import Box, object_counts
-from viz.playback import Playback
 from viz.scene import Polyline, Scene, View
 
 BAR_STEPS = (1.0, 2.0, 5.0)
@@ -52,10 +53,24 @@ def draw_legend(
     ]
     taken = _draw_ends(picture, scene, view, dark)
     taken.append(draw_title(picture, view, title_lines(result), dark=dark))
-    taken += draw_key(picture, view, key, dark=dark)
+    at_right = _is_left_crowded(scene, view, len(key))
+    taken += draw_key(picture, view, key, at_right=at_right, dark=dark)
     if view.px_per_m is not None:
-        taken.append(_draw_scale_bar(picture, view, dark))
+        taken.append(_draw_scale_bar(picture, view, dark, at_left=at_right))
     return taken
+
+
+def _is_left_crowded(scene: Scene, view: View, n_rows: int) -> bool:
+    """Whether paths lead through the place at the bottom left, and fewer at the right."""
+    text_px, margin = _sizes(view)
+    W, H = view.size
+    paths = np.concatenate(
+        [line.points_m for line in scene.polylines if line.label] or [scene.path_m]
+    )
+    uv, depth = view.project(paths)
+    low = (depth > 0) & (uv[:, 1] > H - 2 * margin - 1.6 * text_px * n_rows)
+    left, right = (low & (uv[:, 0] < 0.25 * W)).sum(), (low & (uv[:, 0] > 0.75 * W)).sum()
+    return bool(left > right)
 
 
 def draw_points_legend(picture: Image, view: View, result: Result, *, dark: bool = False) -> None:
@@ -68,9 +83,17 @@ def draw_points_legend(picture: Image, view: View, result: Result, *, dark: bool
 
 
 def draw_moment_legend(
-    picture: Image, view: View, result: Result, playback: Playback, k: int, *, dark: bool = False
+    picture: Image,
+    view: View,
+    result: Result,
+    stage: Stage,
+    k: int,
+    key: Sequence[KeyEntry],
+    *,
+    dark: bool = False,
 ) -> list[Box]:
-    """Title with the frame's number and time, and a legend of the boxes; the parts they take."""
+    """Title with the frame's number and time, and the legend; the parts that they take."""
+    playback = stage.playback
     facts = [f"frame {playback.frame_index[k]}", f"{playback.timestamps_s[k]:.2f} s"]
     boxes = playback.boxes[k]
     if counts := object_counts(result.objects[[box.row for box in boxes]]):
@@ -79,20 +102,23 @@ def draw_moment_legend(
         facts.append("camera lost")
     lines = [title_lines(result)[0], ",  ".join(facts)]
     taken = [draw_title(picture, view, lines, dark=dark)]
-    return taken + draw_key(picture, view, moment_key(boxes), dark=dark)
+    return taken + draw_key(picture, view, key, dark=dark)
 
 
-def moment_key(boxes: Sequence[ObjectBox]) -> list[KeyEntry]:
-    """What explains the boxes of one frame, and the camera."""
-    key = [KeyEntry("camera", (style.ESTIMATE,), 3.0)]
+def moment_key(stage: Stage, boxes: Sequence[ObjectBox]) -> list[KeyEntry]:
+    """What explains the camera, these boxes and the grid on the ground."""
+    key = [KeyEntry("camera and its path", (style.ESTIMATE,), 3.0)]
     for state, label, width_px in (
-        (ObjectState.MOVING, "moving objects, and where they were", 3.0),
-        (ObjectState.COASTING, "hidden, as predicted", 1.4),
+        (ObjectState.MOVING, "moving, and its path", 3.0),
+        (ObjectState.COASTING, "hidden, predicted", 1.4),
         (ObjectState.STOPPED, "standing still", 1.0),
     ):
         colors = tuple(box.color for box in boxes if box.state == str(state))
         if colors:
             key.append(KeyEntry(label, colors, width_px, state is ObjectState.COASTING))
+    if np.isfinite(stage.ground_m).any():
+        step_m = grid_step_m(stage.reach_m)
+        key.append(KeyEntry(f"ground, lines {step_m:g} m apart", (style.GREY,), 1.0))
     return key
 
 
@@ -158,9 +184,14 @@ def draw_title(picture: Image, view: View, lines: list[str], *, dark: bool = Fal
 
 
 def draw_key(
-    picture: Image, view: View, key: Sequence[KeyEntry], *, dark: bool = False
+    picture: Image,
+    view: View,
+    key: Sequence[KeyEntry],
+    *,
+    at_right: bool = False,
+    dark: bool = False,
 ) -> list[Box]:
-    """The legend at the bottom left; the part that it takes."""
+    """The legend at the bottom left or right; the part that it takes."""
     if not key:
         return []
     ink, panel = _inks(dark)
@@ -169,22 +200,23 @@ def draw_key(
     width = sample + text_px + max(style.text_size(entry.label, text_px)[0] for entry in key)
     top = view.size[1] - margin - step * len(key)
     pad = round(0.6 * text_px)
-    box = (margin - pad, top - pad // 2, margin + width, view.size[1] - margin + pad)
+    left_px = view.size[0] - margin - width if at_right else margin
+    box = (left_px - pad, top - pad // 2, left_px + width, view.size[1] - margin + pad)
     style.draw_panel(picture, box, panel)
     for row, entry in enumerate(key):
         v = top + row * step + step // 2
         colors = list(dict.fromkeys(entry.colors))[:MOST_COLORS]
-        at_px = np.linspace(margin, margin + sample, len(colors) + 1)
+        at_px = np.linspace(left_px, left_px + sample, len(colors) + 1)
         for color, left, right in zip(colors, at_px, at_px[1:], strict=False):
             shown = style.on_dark(color) if dark else color
             ends = np.array([[left, v], [right, v]])
             draw_segment(picture, view, ends, shown, entry.width_px, dashed=entry.dashed)
-        at = (margin + sample + text_px // 2, v + round(0.36 * text_px))
+        at = (left_px + sample + text_px // 2, v + round(0.36 * text_px))
         style.draw_text(picture, entry.label, at, text_px, ink)
     return [box]
 
 
-def _draw_scale_bar(picture: Image, view: View, dark: bool) -> Box:
+def _draw_scale_bar(picture: Image, view: View, dark: bool, *, at_left: bool = False) -> Box:
     import cv2
 
     assert view.px_per_m is not None
@@ -193,7 +225,8 @@ def _draw_scale_bar(picture: Image, view: View, dark: bool) -> Box:
     W, H = view.size
     length_m = scale_bar_m(view.px_per_m, 0.22 * W)
     length_px = round(length_m * view.px_per_m)
-    left, right, v = W - margin - length_px, W - margin, H - margin - text_px // 4
+    left = margin if at_left else W - margin - length_px
+    right, v = left + length_px, H - margin - text_px // 4
     pad = round(0.6 * text_px)
     box = (left - pad, v - 2 * text_px - pad // 2, right + pad, v + pad)
     style.draw_panel(picture, box, panel)

@@ -5,37 +5,50 @@ Owns what is shown of a frame and in which order. The points are `viz.points`'s.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from pipelines.types import Array, Image
 from viz import style
-from viz.box_marks import draw_boxes
+from viz.box_marks import draw_box_labels, draw_boxes
 from viz.chase import view_reach_m
+from viz.ground import draw_grid, ground_levels_m
 from viz.lines import draw_polyline
 from viz.object_marks import Box
 from viz.object_paths import Polyline
 from viz.playback import Playback
 from viz.scene import View, frustums
 
-FRUSTUM_SHARE = 0.07  # of the reach: depth of the camera's pyramid
+FRUSTUM_SHARE = 0.05  # of the reach: depth of the camera's pyramid
 OLD_S = 3.0  # s, after which the way of an object that is gone grows pale
 PALE = 0.35
 TRAIL_PX, CAMERA_PX, FRUSTUM_PX = 3.0, 3.4, 1.8
 
 
-def draw_moment(
-    picture: Image,
-    view: View,
-    playback: Playback,
-    k: int,
-    taken: list[Box],
-    *,
-    dark: bool = False,
-) -> None:
-    """Draw the k-th frame of the run over a picture of the points, in place.
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A run with the measures that its moments are drawn by.
 
-    taken: parts of the picture that labels must leave free.
+    reach_m: how far the camera typically saw. ground_m: (F,) height of the ground in each frame.
     """
+
+    playback: Playback
+    reach_m: float
+    ground_m: Array
+
+
+def build_stage(playback: Playback) -> Stage:
+    """Measure a run once for all its moments."""
+    reach_m = view_reach_m(playback)
+    return Stage(playback, reach_m, ground_levels_m(playback, reach_m))
+
+
+def draw_moment(picture: Image, view: View, stage: Stage, k: int, *, dark: bool = False) -> None:
+    """Draw the k-th frame of the run over a picture of the points, in place, without words."""
+    playback = stage.playback
+    if view.px_per_m is None:
+        draw_grid(picture, view, playback, k, stage.ground_m[k], stage.reach_m, dark=dark)
     now_s = playback.timestamps_s[k]
     for trail in playback.trails:
         until = int(np.searchsorted(trail.frames, k, side="right"))
@@ -49,19 +62,22 @@ def draw_moment(
         line = Polyline(piece, style.ESTIMATE, CAMERA_PX, "camera")
         draw_polyline(picture, view, line, dark=dark)
     color = style.ESTIMATE if playback.is_tracked[k] else style.STATUS_LOST
-    size_m = FRUSTUM_SHARE * view_reach_m(playback)
+    size_m = FRUSTUM_SHARE * stage.reach_m
     opening = (0.62, 0.4)
     if playback.camera is not None:
         camera = playback.camera
         opening = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
     for outline in frustums(playback.Ts_world_camera[k : k + 1], size_m, opening):
         draw_polyline(picture, view, Polyline(outline, color, FRUSTUM_PX, "camera"), dark=dark)
-    draw_boxes(picture, view, playback.boxes[k], taken, text_px=text_size_px(view), dark=dark)
+    draw_boxes(picture, view, playback.boxes[k], dark=dark)
 
 
-def text_size_px(view: View) -> int:
-    """Size of words over a map picture, legible whatever the picture's size."""
-    return int(np.clip(view.size[0] / 80.0, 12, 36))
+def draw_moment_labels(
+    picture: Image, view: View, playback: Playback, k: int, taken: list[Box]
+) -> None:
+    """The words at the objects of the k-th frame, in place, off the parts `taken`."""
+    text_px = int(np.clip(view.size[0] / 80.0, 12, 36))
+    draw_box_labels(picture, view, playback.boxes[k], taken, text_px)
 
 
 def _camera_path(playback: Playback, k: int) -> list[Array]:

@@ -33,7 +33,11 @@ class Mp4Writer:
         self._ticks = np.round(ticks).astype(np.int64)
         self._container = container
         rate = 1.0 / float(np.median(durations_s))
-        options = {"crf": QUALITY, "preset": "medium", "g": str(max(1, round(KEY_EVERY_S * rate)))}
+        options = {
+            "crf": QUALITY,
+            "preset": "veryfast",
+            "g": str(max(1, round(KEY_EVERY_S * rate))),
+        }
         stream = container.add_stream(
             "libx264", rate=Fraction(rate).limit_denominator(1000), options=options
         )

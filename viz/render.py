@@ -16,9 +16,9 @@ from pipelines.io.files import disk_error
 from pipelines.io.result import Result, load_result
 from pipelines.types import Image
 from viz.chase import chase_views, telling_frame
-from viz.legend import draw_legend, draw_moment_legend, draw_points_legend
+from viz.legend import draw_legend, draw_moment_legend, draw_points_legend, moment_key
 from viz.lines import draw_polyline
-from viz.moment import draw_moment
+from viz.moment import build_stage, draw_moment, draw_moment_labels
 from viz.overlay import write_image
 from viz.playback import Playback, build_playback
 from viz.points import check_names, draw_points
@@ -65,8 +65,11 @@ def render_result(
     pictures = draw_points(playback.scene, chosen, background=background, renderer=renderer)
     for view, picture in zip(chosen, pictures, strict=True):
         if view.name == "chase":
-            taken = draw_moment_legend(picture, view, result, playback, k, dark=dark)
-            draw_moment(picture, view, playback, k, taken, dark=dark)
+            stage = build_stage(playback)
+            draw_moment(picture, view, stage, k, dark=dark)
+            key = moment_key(stage, playback.boxes[k])
+            taken = draw_moment_legend(picture, view, result, stage, k, key, dark=dark)
+            draw_moment_labels(picture, view, playback, k, taken)
         else:
             alone = picture.copy()
             draw_points_legend(alone, view, result, dark=dark)
@@ -93,7 +96,7 @@ def _draw_paths(picture: Image, view: View, result: Result, playback: Playback, 
     for line in scene.polylines:
         draw_polyline(picture, view, line, dark=dark)
     taken = draw_legend(picture, scene, view, result, dark=dark)
-    draw_tags(picture, view, scene.tags, taken, dark=dark)
+    draw_tags(picture, view, scene, taken, dark=dark)
 
 
 def _position(playback: Playback, following: list[View], frame: int | None) -> int:

@@ -17,7 +17,7 @@ from pipelines.types import Array, Image
 from viz import style
 from viz.chase import chase_views
 from viz.legend import draw_key, draw_moment_legend, moment_key
-from viz.moment import draw_moment
+from viz.moment import build_stage, draw_moment, draw_moment_labels
 from viz.mp4 import open_mp4
 from viz.playback import Playback, build_playback
 from viz.points import check_names, draw_points
@@ -67,17 +67,20 @@ def write_video(
     pictures = draw_points(
         playback.scene, views[:1] if still else views, background=background, renderer=renderer
     )
-    ground = next(pictures)
+    ground, stage = next(pictures), build_stage(playback)
+    # One legend for all frames: it must not jump about.
+    key = moment_key(stage, [box for boxes in playback.boxes for box in boxes])
     with open_mp4(path, size, durations_s(playback.timestamps_s)) as video:
         for k, own in enumerate(views):
             if k and not still:
-                ground = next(pictures)
+                ground, stage = next(pictures), build_stage(playback)
             picture = ground.copy()
+            draw_moment(picture, own, stage, k, dark=dark)
             if frame_px:
-                taken = draw_key(picture, own, moment_key(playback.boxes[k]), dark=dark)
+                taken = draw_key(picture, own, key, dark=dark)
             else:
-                taken = draw_moment_legend(picture, own, result, playback, k, dark=dark)
-            draw_moment(picture, own, playback, k, taken, dark=dark)
+                taken = draw_moment_legend(picture, own, result, stage, k, key, dark=dark)
+            draw_moment_labels(picture, own, playback, k, taken)
             if frame_px:
                 picture = np.concatenate([frames.at(k, (size[0], frame_px)), picture])
             video.add(picture)

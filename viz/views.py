@@ -1,6 +1,7 @@
 """Viewpoints that show a whole map without being told: from above, and three-quarter.
 
-Owns the choice of still views; those that follow the camera are `viz.chase`'s. Pure geometry, draws nothing.
+Owns the choice of still views; those that follow the camera are `viz.chase`'s. Pure geometry, draws
+nothing.
 """
 
 from __future__ import annotations
