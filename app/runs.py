@@ -8,12 +8,15 @@ from __future__ import annotations
 import ctypes
 from argparse import Namespace
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from app import bootstrap, console
+from app.arguments import VIEWS
 from pipelines.errors import ConfigError, DyObError
 
 SIMULATED = "simulated"
+VIDEO = "video.mp4"
 INTERRUPTED = 130
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
 
@@ -69,6 +72,7 @@ def demo(arguments: Namespace) -> int:
             console.say(f"{console.shorten(result.folder / 'frames')}/ with each frame annotated")
         console.next_steps(
             {
+                "a video of it": f"render {console.shorten(result.folder)} --video",
                 "your own data": "run PATH",
                 "is it fit?": "doctor PATH",
                 "layouts": "datasets",
@@ -110,22 +114,39 @@ def optimize(arguments: Namespace) -> int:
 
 
 def render(arguments: Namespace) -> int:
-    """`render RESULT`: PNG files in the result folder."""
+    """`render RESULT`: PNG files in the result folder, and an MP4 where one is asked for."""
     from pipelines.io.folder import open_result_folder
     from viz.plots import plot_result
     from viz.render import render_result
 
     folder = open_result_folder(arguments.result)
+    options = {"size": arguments.size, "background": arguments.background}
     with console.warnings(), console.working(f"drawing {console.shorten(folder)}"):
         pictures = render_result(
-            folder,
-            size=arguments.size,
-            views=tuple(arguments.views),
-            background=arguments.background,
+            folder, **options, views=tuple(arguments.view or VIEWS), frame=arguments.frame
         )
         pictures += plot_result(folder)
+    if arguments.video:
+        pictures.append(_video(folder, arguments))
     console.pictures(pictures)
     return 0
+
+
+def _video(folder: Path, arguments: Namespace) -> Path:
+    from pipelines.io.result import load_result
+    from viz.render import renders_folder
+    from viz.video import write_video
+
+    result = load_result(folder)
+    with console.warnings(), console.counting("drawing the video") as progress:
+        return write_video(
+            result,
+            renders_folder(result) / VIDEO,
+            view=arguments.video,
+            width=arguments.size[0],
+            background=arguments.background,
+            progress=progress,
+        )
 
 
 def keep_freed_memory() -> None:

@@ -12,14 +12,10 @@ from typing import Any
 import numpy as np
 
 from pipelines.io.result import Result
-from pipelines.object_types import ObjectState
 from pipelines.types import Image
 from viz import style
-from viz.boxes import ObjectBox
-from viz.ground import grid_step_m
 from viz.lines import draw_segment
-from viz.moment import Stage
-from viz.object_marks import Box, object_counts
+from viz.object_marks import Box
 from viz.scene import Polyline, Scene, View
 
 BAR_STEPS = (1.0, 2.0, 5.0)
@@ -82,46 +78,6 @@ def draw_points_legend(picture: Image, view: View, result: Result, *, dark: bool
         _draw_scale_bar(picture, view, dark)
 
 
-def draw_moment_legend(
-    picture: Image,
-    view: View,
-    result: Result,
-    stage: Stage,
-    k: int,
-    key: Sequence[KeyEntry],
-    *,
-    dark: bool = False,
-) -> list[Box]:
-    """Title with the frame's number and time, and the legend; the parts that they take."""
-    playback = stage.playback
-    facts = [f"frame {playback.frame_index[k]}", f"{playback.timestamps_s[k]:.2f} s"]
-    boxes = playback.boxes[k]
-    if counts := object_counts(result.objects[[box.row for box in boxes]]):
-        facts.append(counts)
-    if not playback.is_tracked[k]:
-        facts.append("camera lost")
-    lines = [title_lines(result)[0], ",  ".join(facts)]
-    taken = [draw_title(picture, view, lines, dark=dark)]
-    return taken + draw_key(picture, view, key, dark=dark)
-
-
-def moment_key(stage: Stage, boxes: Sequence[ObjectBox]) -> list[KeyEntry]:
-    """What explains the camera, these boxes and the grid on the ground."""
-    key = [KeyEntry("camera and its path", (style.ESTIMATE,), 3.0)]
-    for state, label, width_px in (
-        (ObjectState.MOVING, "moving, and its path", 3.0),
-        (ObjectState.COASTING, "hidden, predicted", 1.4),
-        (ObjectState.STOPPED, "standing still", 1.0),
-    ):
-        colors = tuple(box.color for box in boxes if box.state == str(state))
-        if colors:
-            key.append(KeyEntry(label, colors, width_px, state is ObjectState.COASTING))
-    if np.isfinite(stage.ground_m).any():
-        step_m = grid_step_m(stage.reach_m)
-        key.append(KeyEntry(f"ground, lines {step_m:g} m apart", (style.GREY,), 1.0))
-    return key
-
-
 def scale_bar_m(px_per_m: float, longest_px: float) -> float:
     """The longest of 1, 2, 5, 10, ... metres (or 0.5, 0.2, ...) that fits `longest_px`."""
     power = 10.0 ** np.floor(np.log10(longest_px / px_per_m))
@@ -154,9 +110,15 @@ def digits(value: float) -> str:
     return f"{value:.{int(np.clip(2 - power, 0, 6))}f}"
 
 
+def text_size_px(view: View) -> int:
+    """Size of words over a map picture, legible whatever the picture's size."""
+    W = view.size[0]
+    return int(np.clip(max(W / 75.0, min(15.0, W / 50.0)), 11, 40))
+
+
 def _sizes(view: View) -> tuple[int, int]:
-    """Text size and margin in pixels, legible whatever the picture's size."""
-    text = int(np.clip(view.size[0] / 75.0, 11, 40))
+    """Text size and margin in pixels."""
+    text = text_size_px(view)
     return text, round(1.2 * text)
 
 

@@ -14,6 +14,7 @@ from viz import style
 from viz.box_marks import draw_box_labels, draw_boxes
 from viz.chase import view_reach_m
 from viz.ground import draw_grid, ground_levels_m
+from viz.legend import text_size_px
 from viz.lines import draw_polyline
 from viz.object_marks import Box
 from viz.object_paths import Polyline
@@ -76,7 +77,7 @@ def draw_moment_labels(
     picture: Image, view: View, playback: Playback, k: int, taken: list[Box]
 ) -> None:
     """The words at the objects of the k-th frame, in place, off the parts `taken`."""
-    text_px = int(np.clip(view.size[0] / 80.0, 12, 36))
+    text_px = round(0.94 * text_size_px(view))
     draw_box_labels(picture, view, playback.boxes[k], taken, text_px)
 
 

@@ -16,17 +16,19 @@ from pipelines.io.files import disk_error
 from pipelines.io.result import Result, load_result
 from pipelines.types import Image
 from viz.chase import chase_views, telling_frame
-from viz.legend import draw_legend, draw_moment_legend, draw_points_legend, moment_key
+from viz.legend import draw_legend, draw_points_legend
 from viz.lines import draw_polyline
 from viz.moment import build_stage, draw_moment, draw_moment_labels
+from viz.moment_legend import draw_moment_legend, moment_key
 from viz.overlay import write_image
 from viz.playback import Playback, build_playback
 from viz.points import check_names, draw_points
 from viz.scene import View
 from viz.tags import draw_tags
+from viz.views import VIEW_NAMES as STILL_VIEWS
 from viz.views import choose_view
 
-VIEW_NAMES = ("top", "iso", "chase")
+VIEW_NAMES = (*STILL_VIEWS, "chase")
 
 
 def render_result(
@@ -49,6 +51,8 @@ def render_result(
     an unknown name.
     """
     check_names(background, renderer)
+    if unknown := [name for name in views if name not in VIEW_NAMES]:
+        raise ValueError(f"expected views of {', '.join(VIEW_NAMES)}, found '{unknown[0]}'")
     result = load_result(folder)
     playback = build_playback(result)
     following = chase_views(playback, size) if "chase" in views else []

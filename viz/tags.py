@@ -9,6 +9,7 @@ import numpy as np
 
 from pipelines.types import Image
 from viz import style
+from viz.legend import text_size_px
 from viz.object_marks import Box, overlaps
 from viz.scene import Scene, View
 
@@ -26,7 +27,7 @@ def draw_tags(
     import cv2
 
     W, H = view.size
-    text_px = min(max(10, round(0.82 * W / 75.0)), 34)
+    text_px = max(10, round(0.85 * text_size_px(view)))
     radius = max(3, round(0.34 * text_px))
     ink, panel = (style.WHITE, style.BACKGROUNDS["black"]) if dark else (style.INK, style.WHITE)
     taken, seen, paths = list(taken), [], _path_parts(scene, view)

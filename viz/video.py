@@ -16,8 +16,9 @@ from pipelines.io.result import Result
 from pipelines.types import Array, Image
 from viz import style
 from viz.chase import chase_views
-from viz.legend import draw_key, draw_moment_legend, moment_key
+from viz.legend import draw_key
 from viz.moment import build_stage, draw_moment, draw_moment_labels
+from viz.moment_legend import draw_moment_legend, moment_key
 from viz.mp4 import open_mp4
 from viz.playback import Playback, build_playback
 from viz.points import check_names, draw_points
