@@ -167,7 +167,8 @@ def draw_key(
     style.draw_panel(picture, box, panel)
     for row, entry in enumerate(key):
         v = top + row * step + step // 2
-        colors = list(dict.fromkeys(entry.colors))[:MOST_COLORS]
+        most = 2 if entry.dashed else MOST_COLORS  # a dash needs room to be one
+        colors = list(dict.fromkeys(entry.colors))[:most]
         at_px = np.linspace(left_px, left_px + sample, len(colors) + 1)
         for color, left, right in zip(colors, at_px, at_px[1:], strict=False):
             shown = style.on_dark(color) if dark else color

@@ -29,6 +29,7 @@ from viz.views import VIEW_NAMES as STILL_VIEWS
 from viz.views import choose_view
 
 VIEW_NAMES = (*STILL_VIEWS, "chase")
+COMPRESSION = 7  # there are few of these pictures, and they are shown to others
 
 
 def render_result(
@@ -78,10 +79,10 @@ def render_result(
             alone = picture.copy()
             draw_points_legend(alone, view, result, dark=dark)
             written.append(target / f"static_{view.name}.png")
-            write_image(written[-1], alone)
+            write_image(written[-1], alone, compression=COMPRESSION)
             _draw_paths(picture, view, result, playback, dark)
         written.append(target / f"map_{view.name}.png")
-        write_image(written[-1], picture)
+        write_image(written[-1], picture, compression=COMPRESSION)
     return written
 
 

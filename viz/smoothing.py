@@ -21,7 +21,7 @@ def smoothed(values: Array, timestamps_s: Array) -> Array:
     if len(values) < 2:
         return np.array(values, float)
     sigma = CALM_S / max(float(np.median(np.diff(timestamps_s))), 1e-3)
-    n = min(int(4 * sigma) + 1, len(values) - 1)
+    n = int(4 * sigma) + 1
     pad = [(n, n)] + [(0, 0)] * (values.ndim - 1)
     longer = np.pad(np.asarray(values, float), pad, mode="reflect", reflect_type="odd")
     return np.asarray(gaussian_filter1d(longer, sigma, 0, mode="nearest")[n:-n])
