@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Callable
 
 LATEST = "results/latest"
-VIEWS = ("top", "perspective")
+VIEWS = ("top", "iso", "chase")
 SIZES_PX = (160, 8192)  # smaller pictures hold no text; larger ones no renderer makes
 KINDS = ("depth", "flow", "masks")  # of files that prepare makes
 
@@ -106,7 +106,26 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--size", type=_size, default=(1280, 720), metavar="WxH", help="default: 1280x720"
     )
-    parser.add_argument("--views", nargs="+", choices=VIEWS, default=list(VIEWS), metavar="VIEW")
+    parser.add_argument(
+        "--view",
+        nargs="+",
+        action="extend",
+        choices=VIEWS,
+        metavar="VIEW",
+        help="top: from above, to scale; iso: three-quarter; chase: from behind the camera at one "
+        "frame, with the objects' boxes (default: all)",
+    )
+    parser.add_argument(
+        "--frame", type=_not_negative, metavar="K", help="of chase (default: the most telling one)"
+    )
+    parser.add_argument(
+        "--video",
+        nargs="?",
+        const="chase",
+        choices=VIEWS,
+        metavar="VIEW",
+        help="an MP4 as well: annotated frames above, the map below (default view: chase)",
+    )
     parser.add_argument("--background", choices=("white", "black"), default="white")
 
 

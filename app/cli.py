@@ -64,10 +64,12 @@ optimize RESULT --set batch.method=partial""",
     ),
     "render": Verb(
         "app.runs:render",
-        "draw a result folder's map and trajectory, without a display",
+        "draw a result folder's map, paths, objects and a video, without a display",
         """\
 render                          # the latest result
-render RESULT --size 1920x1080 --views top""",
+render RESULT --view top iso --size 1920x1080
+render RESULT --view chase --frame 40 --background black
+render RESULT --video           # an MP4 as well, for any browser""",
     ),
     "view": Verb(
         "app.viewing:view",

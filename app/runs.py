@@ -8,12 +8,15 @@ from __future__ import annotations
 import ctypes
 from argparse import Namespace
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from app import bootstrap, console, viewing
+from app.arguments import VIEWS
 from pipelines.errors import ConfigError, DyObError
 
 SIMULATED = "simulated"
+VIDEO = "video.mp4"
 INTERRUPTED = 130
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
 
@@ -80,6 +83,7 @@ def demo(arguments: Namespace) -> int:
         console.next_steps(
             {
                 "in the browser": f"view {console.shorten(result.folder)}",
+                "a video of it": f"render {console.shorten(result.folder)} --video",
                 "your own data": "run PATH",
                 "is it fit?": "doctor PATH",
                 "layouts": "datasets",
@@ -121,7 +125,7 @@ def optimize(arguments: Namespace) -> int:
 
 
 def render(arguments: Namespace) -> int:
-    """`render RESULT`: PNG files in the result folder, and the scene as a page."""
+    """`render RESULT`: pictures in the result folder, the scene as a page, a video on demand."""
     from pipelines.io import folder as names
     from pipelines.io.folder import open_result_folder
     from pipelines.io.result import load_result
@@ -130,17 +134,34 @@ def render(arguments: Namespace) -> int:
     from viz.render import render_result
 
     folder = open_result_folder(arguments.result)
+    options = {"size": arguments.size, "background": arguments.background}
     with console.warnings(), console.working(f"drawing {console.shorten(folder)}"):
         pictures = render_result(
-            folder,
-            size=arguments.size,
-            views=tuple(arguments.views),
-            background=arguments.background,
+            folder, **options, views=tuple(arguments.view or VIEWS), frame=arguments.frame
         )
         pictures += plot_result(folder)
         pictures.append(export_scene(load_result(folder), folder / names.SCENE))
+    if arguments.video:
+        pictures.append(_video(folder, arguments))
     console.pictures(pictures)
     return 0
+
+
+def _video(folder: Path, arguments: Namespace) -> Path:
+    from pipelines.io.result import load_result
+    from viz.render import renders_folder
+    from viz.video import write_video
+
+    result = load_result(folder)
+    with console.warnings(), console.counting("drawing the video") as progress:
+        return write_video(
+            result,
+            renders_folder(result) / VIDEO,
+            view=arguments.video,
+            width=arguments.size[0],
+            background=arguments.background,
+            progress=progress,
+        )
 
 
 def keep_freed_memory() -> None:

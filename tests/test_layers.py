@@ -24,12 +24,13 @@ STDLIB_ONLY = (
 OWNERS = {
     "gtsam": ("pipelines/backend/",),
     "gtsam_unstable": ("pipelines/backend/",),
+    "av": ("viz/mp4.py",),
     "meshcat": ("viz/browser.py", "viz/browser/"),
     "torch": ("pipelines/detection/", "pipelines/flow/"),
     "torchvision": ("pipelines/detection/", "pipelines/flow/"),
     "onnxruntime": ("pipelines/detection/", "pipelines/flow/"),
 }
-LAZY = ("open3d", "matplotlib", "evo", "filterpy", "gtsam", "meshcat", "torch", "onnxruntime")
+LAZY = ("av", "open3d", "matplotlib", "evo", "filterpy", "gtsam", "meshcat", "torch", "onnxruntime")
 
 
 def sources(*layers: str) -> list[Path]:

@@ -5,6 +5,8 @@ Owns words and marks over a drawn map. Knows no renderer.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,12 +14,22 @@ import numpy as np
 from pipelines.io.result import Result
 from pipelines.types import Image
 from viz import style
-from viz.lines import line_scale
+from viz.lines import draw_segment
 from viz.object_marks import Box
 from viz.scene import Polyline, Scene, View
 
 BAR_STEPS = (1.0, 2.0, 5.0)
 MOST_COLORS = 4  # in the sample of a legend entry for lines of many colours
+
+
+@dataclass(frozen=True, slots=True)
+class KeyEntry:
+    """A line of the legend: words beside a sample of the line that they explain."""
+
+    label: str
+    colors: tuple[style.Color, ...]
+    width_px: float
+    dashed: bool = False
 
 
 def draw_legend(
@@ -27,14 +39,43 @@ def draw_legend(
 
     Returns the parts of the picture (u0, v0, u1, v1) that they take.
     """
-    ink = style.WHITE if dark else style.INK
-    panel = style.BACKGROUNDS["black" if dark else "white"]
-    taken = _draw_ends(picture, scene, view, panel, dark)
-    taken.append(_draw_title(picture, result, view, ink, panel))
-    taken += _draw_key(picture, scene, view, ink, panel, dark)
+    entries: dict[str, list[Polyline]] = {}
+    for line in scene.polylines:
+        if line.label:
+            entries.setdefault(line.label, []).append(line)
+    key = [
+        KeyEntry(label, tuple(line.color for line in lines), lines[0].width_px)
+        for label, lines in reversed(entries.items())
+    ]
+    taken = _draw_ends(picture, scene, view, dark)
+    taken.append(draw_title(picture, view, title_lines(result), dark=dark))
+    at_right = _is_left_crowded(scene, view, len(key))
+    taken += draw_key(picture, view, key, at_right=at_right, dark=dark)
     if view.px_per_m is not None:
-        taken.append(_draw_scale_bar(picture, view, ink, panel))
+        taken.append(_draw_scale_bar(picture, view, dark, at_left=at_right))
     return taken
+
+
+def _is_left_crowded(scene: Scene, view: View, n_rows: int) -> bool:
+    """Whether paths lead through the place at the bottom left, and fewer at the right."""
+    text_px, margin = _sizes(view)
+    W, H = view.size
+    paths = np.concatenate(
+        [line.points_m for line in scene.polylines if line.label] or [scene.path_m]
+    )
+    uv, depth = view.project(paths)
+    low = (depth > 0) & (uv[:, 1] > H - 2 * margin - 1.6 * text_px * n_rows)
+    left, right = (low & (uv[:, 0] < 0.25 * W)).sum(), (low & (uv[:, 0] > 0.75 * W)).sum()
+    return bool(left > right)
+
+
+def draw_points_legend(picture: Image, view: View, result: Result, *, dark: bool = False) -> None:
+    """What stands on a picture of the points alone: whose they are, and how large the map is."""
+    name, facts = title_lines(result)[:2]
+    points = next(fact for fact in facts.split(",  ") if fact.endswith("map points"))
+    draw_title(picture, view, [name, f"static map,  {points}"], dark=dark)
+    if view.px_per_m is not None:
+        _draw_scale_bar(picture, view, dark)
 
 
 def scale_bar_m(px_per_m: float, longest_px: float) -> float:
@@ -69,15 +110,27 @@ def digits(value: float) -> str:
     return f"{value:.{int(np.clip(2 - power, 0, 6))}f}"
 
 
+def text_size_px(view: View) -> int:
+    """Size of words over a map picture, legible whatever the picture's size."""
+    W = view.size[0]
+    return int(np.clip(max(W / 75.0, min(15.0, W / 50.0)), 11, 40))
+
+
 def _sizes(view: View) -> tuple[int, int]:
-    """Text size and margin in pixels, legible whatever the picture's size."""
-    text = int(np.clip(view.size[0] / 75.0, 11, 40))
+    """Text size and margin in pixels."""
+    text = text_size_px(view)
     return text, round(1.2 * text)
 
 
-def _draw_title(picture: Image, result: Result, view: View, ink: Any, panel: Any) -> Box:
+def _inks(dark: bool) -> tuple[style.Color, style.Color]:
+    """The colours of words, and of the panels beneath them."""
+    return (style.WHITE if dark else style.INK), style.BACKGROUNDS["black" if dark else "white"]
+
+
+def draw_title(picture: Image, view: View, lines: list[str], *, dark: bool = False) -> Box:
+    """Lines of text at the top left, the first of them large; the part that they take."""
+    ink, panel = _inks(dark)
     text_px, margin = _sizes(view)
-    lines = title_lines(result)
     sizes = [round(1.35 * text_px)] + [text_px] * (len(lines) - 1)
     weights = [600] + [400] * (len(lines) - 1)
     widths = [style.text_size(*args)[0] for args in zip(lines, sizes, weights, strict=True)]
@@ -92,46 +145,51 @@ def _draw_title(picture: Image, result: Result, view: View, ink: Any, panel: Any
     return box
 
 
-def _draw_key(
-    picture: Image, scene: Scene, view: View, ink: Any, panel: Any, dark: bool
+def draw_key(
+    picture: Image,
+    view: View,
+    key: Sequence[KeyEntry],
+    *,
+    at_right: bool = False,
+    dark: bool = False,
 ) -> list[Box]:
-    import cv2
-
-    text_px, margin = _sizes(view)
-    entries: dict[str, list[Polyline]] = {}
-    for line in scene.polylines:
-        if line.label:
-            entries.setdefault(line.label, []).append(line)
-    if not entries:
+    """The legend at the bottom left or right; the part that it takes."""
+    if not key:
         return []
+    ink, panel = _inks(dark)
+    text_px, margin = _sizes(view)
     step, sample = round(1.6 * text_px), round(2.6 * text_px)
-    width = sample + text_px + max(style.text_size(label, text_px)[0] for label in entries)
-    top = view.size[1] - margin - step * len(entries)
+    width = sample + text_px + max(style.text_size(entry.label, text_px)[0] for entry in key)
+    top = view.size[1] - margin - step * len(key)
     pad = round(0.6 * text_px)
-    box = (margin - pad, top - pad // 2, margin + width, view.size[1] - margin + pad)
+    left_px = view.size[0] - margin - width if at_right else margin
+    box = (left_px - pad, top - pad // 2, left_px + width, view.size[1] - margin + pad)
     style.draw_panel(picture, box, panel)
-    for row, (label, lines) in enumerate(reversed(entries.items())):
+    for row, entry in enumerate(key):
         v = top + row * step + step // 2
-        thick = max(1, round(lines[0].width_px * line_scale(view)))
-        colors = list(dict.fromkeys(line.color for line in lines))[:MOST_COLORS]
-        at_px = np.linspace(margin, margin + sample, len(colors) + 1).round().astype(int).tolist()
+        most = 2 if entry.dashed else MOST_COLORS  # a dash needs room to be one
+        colors = list(dict.fromkeys(entry.colors))[:most]
+        at_px = np.linspace(left_px, left_px + sample, len(colors) + 1)
         for color, left, right in zip(colors, at_px, at_px[1:], strict=False):
             shown = style.on_dark(color) if dark else color
-            cv2.line(picture, (left, v), (right, v), shown, thick, cv2.LINE_AA)
-        at = (margin + sample + text_px // 2, v + round(0.36 * text_px))
-        style.draw_text(picture, label, at, text_px, ink)
+            ends = np.array([[left, v], [right, v]])
+            draw_segment(picture, view, ends, shown, entry.width_px, dashed=entry.dashed)
+        at = (left_px + sample + text_px // 2, v + round(0.36 * text_px))
+        style.draw_text(picture, entry.label, at, text_px, ink)
     return [box]
 
 
-def _draw_scale_bar(picture: Image, view: View, ink: Any, panel: Any) -> Box:
+def _draw_scale_bar(picture: Image, view: View, dark: bool, *, at_left: bool = False) -> Box:
     import cv2
 
     assert view.px_per_m is not None
+    ink, panel = _inks(dark)
     text_px, margin = _sizes(view)
     W, H = view.size
     length_m = scale_bar_m(view.px_per_m, 0.22 * W)
     length_px = round(length_m * view.px_per_m)
-    left, right, v = W - margin - length_px, W - margin, H - margin - text_px // 4
+    left = margin if at_left else W - margin - length_px
+    right, v = left + length_px, H - margin - text_px // 4
     pad = round(0.6 * text_px)
     box = (left - pad, v - 2 * text_px - pad // 2, right + pad, v + pad)
     style.draw_panel(picture, box, panel)
@@ -148,10 +206,11 @@ def _draw_scale_bar(picture: Image, view: View, ink: Any, panel: Any) -> Box:
     return box
 
 
-def _draw_ends(picture: Image, scene: Scene, view: View, panel: Any, dark: bool) -> list[Box]:
+def _draw_ends(picture: Image, scene: Scene, view: View, dark: bool) -> list[Box]:
     """A disc and a word at the first and the last camera."""
     import cv2
 
+    _, panel = _inks(dark)
     text_px, _ = _sizes(view)
     taken: list[Box] = []
     ends = (("end", scene.path_m[-1:], style.END), ("start", scene.path_m[:1], style.START))

@@ -227,13 +227,16 @@ class FrameWriter:
                 logger.warning("no more annotated frames: %s", error)
 
 
-def write_image(path: Path | str, image: Image, *, sync: bool = True) -> None:
-    """Write an RGB image in one step, as its suffix says. Raises DyObError where it cannot."""
+def write_image(path: Path | str, image: Image, *, sync: bool = True, compression: int = 1) -> None:
+    """Write an RGB image in one step, as its suffix says. Raises DyObError where it cannot.
+
+    compression: of PNG files, 1 (fast, for pictures by the hundred) to 9 (small).
+    """
     import cv2
 
     path = Path(path)
-    fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-    options = [cv2.IMWRITE_JPEG_QUALITY, 92] if path.suffix in (".jpg", ".jpeg") else fast
+    png = [cv2.IMWRITE_PNG_COMPRESSION, compression]
+    options = [cv2.IMWRITE_JPEG_QUALITY, 92] if path.suffix in (".jpg", ".jpeg") else png
     try:
         ok, data = cv2.imencode(path.suffix, np.ascontiguousarray(image[..., ::-1]), options)
     except cv2.error:

@@ -1,11 +1,10 @@
-"""The map pictures of a result folder: points, paths and cameras, with scale bar and legend.
+"""The pictures of a result folder: its map, the paths in it, and one moment of the run.
 
-Owns the order of drawing and the choice of the renderer. Each layer is a file beside this one.
+Owns which pictures there are and the order of drawing. Each layer is a file beside this one.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,90 +13,108 @@ import numpy as np
 from pipelines.errors import DyObError
 from pipelines.io import folder as names
 from pipelines.io.files import disk_error
-from pipelines.io.result import load_result
+from pipelines.io.result import Result, load_result
 from pipelines.types import Image
-from viz import style
-from viz.legend import draw_legend
+from viz.chase import chase_views, telling_frame
+from viz.legend import draw_legend, draw_points_legend
 from viz.lines import draw_polyline
+from viz.moment import build_stage, draw_moment, draw_moment_labels
+from viz.moment_legend import draw_moment_legend, moment_key
 from viz.overlay import write_image
-from viz.scene import Scene, View, build_scene, extent_m
+from viz.playback import Playback, build_playback
+from viz.points import check_names, draw_points
+from viz.scene import View
 from viz.tags import draw_tags
-from viz.views import VIEW_NAMES, choose_view
+from viz.views import VIEW_NAMES as STILL_VIEWS
+from viz.views import choose_view
 
-logger = logging.getLogger("dyob.viz")
-
-RENDERERS = ("auto", "open3d", "splat")
-POINT_SHARE = 0.001  # radius of a point as a share of the map's extent
-LIGHTEST = 0.82  # colours are scaled down to this on white, where lighter ones would vanish
+VIEW_NAMES = (*STILL_VIEWS, "chase")
+COMPRESSION = 7  # there are few of these pictures, and they are shown to others
 
 
 def render_result(
     folder: Path | str,
     *,
     size: tuple[int, int] = (1280, 720),
-    views: tuple[str, ...] = VIEW_NAMES,
+    views: Sequence[str] = VIEW_NAMES,
+    frame: int | None = None,
     background: str = "white",
     renderer: str = "auto",
 ) -> list[Path]:
-    """Write renders/map_<view>.png of a result folder; the paths written.
+    """Write renders/ of a result folder; the paths written.
 
-    size: (width, height) in pixels. background: "white" or "black". renderer: "open3d" (needs
+    "top" and "iso" give static_<view>.png, the map's points alone, and map_<view>.png, with the
+    paths of the camera and of all that moved. "chase" gives map_chase.png, from behind the camera
+    at one frame with the objects' boxes then: `frame`, by its index in the run, or the most telling
+    one. size: (width, height) in pixels. background: "white" or "black". renderer: "open3d" (needs
     Vulkan), "splat" (needs nothing) or "auto", the first of them that works here. Raises
-    FormatError for a damaged folder, ValueError for an unknown name.
+    FormatError for a damaged folder, DyObError for a frame that was not processed, ValueError for
+    an unknown name.
     """
-    if background not in style.BACKGROUNDS:
-        raise ValueError(
-            f"render_result: expected background {' or '.join(style.BACKGROUNDS)}, "
-            f"found '{background}'"
-        )
-    if renderer not in RENDERERS:
-        raise ValueError(
-            f"render_result: expected renderer {', '.join(RENDERERS)}, found '{renderer}'"
-        )
+    check_names(background, renderer)
+    if unknown := [name for name in views if name not in VIEW_NAMES]:
+        raise ValueError(f"expected views of {', '.join(VIEW_NAMES)}, found '{unknown[0]}'")
     result = load_result(folder)
-    scene = build_scene(result)
-    chosen = [choose_view(name, scene, size) for name in views]
+    playback = build_playback(result)
+    following = chase_views(playback, size) if "chase" in views else []
+    k = _position(playback, following, frame)
+    chosen = []
+    for name in dict.fromkeys(views):
+        if name != "chase":
+            chosen.append(choose_view(name, playback.scene, size))
+        elif following:
+            chosen.append(following[k])
+    target = renders_folder(result)
+    written = []
+    dark = background != "white"
+    pictures = draw_points(playback.scene, chosen, background=background, renderer=renderer)
+    for view, picture in zip(chosen, pictures, strict=True):
+        if view.name == "chase":
+            stage = build_stage(playback)
+            draw_moment(picture, view, stage, k, dark=dark)
+            key = moment_key(stage, playback.boxes[k])
+            taken = draw_moment_legend(picture, view, result, stage, k, key, dark=dark)
+            draw_moment_labels(picture, view, playback, k, taken)
+        else:
+            alone = picture.copy()
+            draw_points_legend(alone, view, result, dark=dark)
+            written.append(target / f"static_{view.name}.png")
+            write_image(written[-1], alone, compression=COMPRESSION)
+            _draw_paths(picture, view, result, playback, dark)
+        written.append(target / f"map_{view.name}.png")
+        write_image(written[-1], picture, compression=COMPRESSION)
+    return written
+
+
+def renders_folder(result: Result) -> Path:
+    """The result's folder for pictures and videos of the map, made if need be."""
     target = result.folder / names.RENDERS
     try:
         target.mkdir(exist_ok=True)
     except OSError as error:
         raise DyObError(disk_error(target, error)) from error
-    dark = background != "white"
-    written = []
-    pictures = draw_points(scene, chosen, background=background, renderer=renderer)
-    for view, picture in zip(chosen, pictures, strict=True):
-        for line in scene.polylines:
-            draw_polyline(picture, view, line, dark=dark)
-        taken = draw_legend(picture, scene, view, result, dark=dark)
-        draw_tags(picture, view, scene, taken, dark=dark)
-        path = target / f"map_{view.name}.png"
-        write_image(path, picture)
-        written.append(path)
-    return written
+    return target
 
 
-def draw_points(
-    scene: Scene, views: Sequence[View], *, background: str = "white", renderer: str = "auto"
-) -> list[Image]:
-    """The map's points alone, a picture (H, W, 3) uint8 RGB a view, by the renderer asked for.
+def _draw_paths(picture: Image, view: View, result: Result, playback: Playback, dark: bool) -> None:
+    scene = playback.scene
+    for line in scene.polylines:
+        draw_polyline(picture, view, line, dark=dark)
+    taken = draw_legend(picture, scene, view, result, dark=dark)
+    draw_tags(picture, view, scene, taken, dark=dark)
 
-    Where Open3D cannot draw, the software renderer does, and a logged sentence says so.
-    """
-    ground = style.BACKGROUNDS[background]
-    colors = scene.colors
-    if background == "white":
-        colors = np.round(colors * LIGHTEST).astype(np.uint8)
-    radius_m = POINT_SHARE * extent_m(scene.path_m, scene.points_m)
-    if renderer != "splat" and views:
-        from viz.offscreen import render_points
 
-        pictures = render_points(views, scene.points_m, colors, radius_m, ground)
-        if pictures is not None:
-            return [np.ascontiguousarray(picture) for picture in pictures]
-        logger.warning(
-            "Open3D cannot render here (it needs a Vulkan driver; on Debian: apt-get install "
-            "libvulkan1 mesa-vulkan-drivers), so the software renderer draws the map"
+def _position(playback: Playback, following: list[View], frame: int | None) -> int:
+    """Where in the playback the frame is that was asked for, else the most telling one."""
+    if not following:
+        return 0
+    if frame is None:
+        return telling_frame(playback, following)
+    at = np.flatnonzero(playback.frame_index == frame)
+    if len(at) == 0:
+        first, last = playback.frame_index[[0, -1]]
+        raise DyObError(
+            f"expected a frame of this run, {first} to {last}, found {frame}; "
+            "the names of the pictures in frames/ are these numbers"
         )
-    from viz.splat import splat_points
-
-    return [splat_points(view, scene.points_m, colors, radius_m, ground) for view in views]
+    return int(at[0])

@@ -21,6 +21,8 @@ STRAY_QUANTILE = 0.95  # of the points' distances to the path: what lies far bey
 STRAY_FACTOR = 1.6
 N_FRUSTUMS = 15
 FRUSTUM_SHARE = 0.013  # frustum depth as a share of the scene's extent
+TURNED = 0.01  # variance of the horizontal axes from which they count more than the mean upward one
+MOST_TILTED = 0.5  # cosine of the angle to the mean beyond which they are not believed
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +48,8 @@ class View:
     """A pinhole view of the scene: axes of the view as a camera's, size in pixels (width, height).
 
     px_per_m: scale of a map seen from above, or None where the scale varies with distance.
+    near_m: points nearer than this are left out. haze: depths at which points begin to turn to the
+    colour of the ground and at which they have done so, and how far they do (0 to 1), or None.
     """
 
     name: str
@@ -53,6 +57,8 @@ class View:
     K: Array
     T_view_world: Array
     px_per_m: float | None = None
+    near_m: float = 1e-3
+    haze: tuple[float, float, float] | None = None
 
     def project(self, points_m: Array) -> tuple[Array, Array]:
         """Pixels (N, 2) and depths (N,) in metres of world points (N, 3)."""
@@ -80,8 +86,10 @@ def build_scene(result: Result, *, keyframe_every: int | None = None) -> Scene:
             for piece in split_at_gaps(result.gt_timestamps_s, truth)
         ]
     if len(Ts):
-        step = keyframe_every or max(1, round(len(Ts) / N_FRUSTUMS))
         size_m = FRUSTUM_SHARE * extent_m(path, points)
+        length_m = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+        n = int(np.clip(length_m / (2.0 * size_m), 1, N_FRUSTUMS))  # more would be one heap
+        step = keyframe_every or max(1, round(len(Ts) / n))
         polylines += [Polyline(f, style.FRUSTUM, 1.0) for f in frustums(Ts[::step], size_m)]
     for piece in split_at_gaps(result.timestamps_s, path[: len(Ts)]):
         polylines.append(Polyline(piece, style.ESTIMATE, 2.4, "camera, estimated"))
@@ -98,9 +106,14 @@ def near_path(points_m: Array, path_m: Array) -> NDArray[np.bool_]:
     return distance <= STRAY_FACTOR * np.quantile(distance[finite], STRAY_QUANTILE)
 
 
-def frustums(Ts_world_camera: Array, size_m: float) -> list[Array]:
-    """Closed outlines (K of (8, 3)) of small pyramids that open the way the cameras look."""
-    x, y, z = 0.62 * size_m, 0.4 * size_m, size_m
+def frustums(
+    Ts_world_camera: Array, size_m: float, opening: tuple[float, float] = (0.62, 0.4)
+) -> list[Array]:
+    """Closed outlines (K of (10, 3)) of small pyramids that open the way the cameras look.
+
+    opening: half of the width and of the height of a picture at distance 1.
+    """
+    x, y, z = opening[0] * size_m, opening[1] * size_m, size_m
     corners = np.array([[-x, -y, z], [x, -y, z], [x, y, z], [-x, y, z]])
     apex = np.zeros(3)
     order = [apex, *corners, corners[0], apex, corners[1], corners[2], apex, corners[3]]
@@ -119,10 +132,23 @@ def extent_m(path_m: Array, points_m: Array) -> float:
 
 
 def _up(Ts: Array) -> Array:
-    """Mean upward axis of the cameras: tilts average out over a path, so it is near the true up."""
-    up = -Ts[:, :3, 1].sum(0) if len(Ts) else np.array([0.0, -1.0, 0.0])
-    length = np.linalg.norm(up)
-    return up / length if length > 1e-6 else np.array([0.0, -1.0, 0.0])
+    """Upward axis: across the cameras' horizontal axes, near the mean of their upward ones.
+
+    A camera in a hand looks down more often than up, but is hardly ever held askew: where it turned
+    about, its horizontal axes tell what is level. Where it did not, tilts must average out.
+    """
+    if len(Ts) == 0:
+        return np.array([0.0, -1.0, 0.0])
+    mean = -Ts[:, :3, 1].sum(0)
+    length = np.linalg.norm(mean)
+    if length < 1e-6:
+        return np.array([0.0, -1.0, 0.0])
+    mean = mean / length
+    right = Ts[:, :3, 0]
+    spread = right.T @ right / len(Ts) - TURNED * np.outer(mean, mean)
+    up = np.linalg.eigh(spread)[1][:, 0]
+    up = up * np.sign(up @ mean)
+    return up if up @ mean > MOST_TILTED else mean
 
 
 def _forward(Ts: Array, up: Array) -> Array:

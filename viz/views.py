@@ -1,31 +1,35 @@
-"""Viewpoints that show a whole map without being told: from above, and along the path.
+"""Viewpoints that show a whole map without being told: from above, and three-quarter.
 
-Owns the choice of views. Pure geometry, draws nothing.
+Owns the choice of still views; those that follow the camera are `viz.chase`'s. Pure geometry, draws
+nothing.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from pipelines.geometry import transform_points
 from pipelines.types import Array
 from viz.scene import Scene, View
 
 # Shares of the picture kept free for title (top), legend and scale bar (bottom), and for looks.
 SIDE_MARGIN, TOP_MARGIN, BOTTOM_MARGIN = 0.06, 0.15, 0.12
 TOP_DISTANCE = 60.0  # extents above the map: so far that heights hardly shift anything
-FIELD_OF_VIEW_DEG = 55.0  # of the perspective view, across the picture
+FIELD_OF_VIEW_DEG = 38.0  # of the three-quarter view, across the picture
+ELEVATION_DEG = 38.0  # it looks down so steeply
+AZIMUTHS_DEG = (-40.0, 40.0, -55.0, 55.0)  # and at such angles to the path, the first if alike
+HAZE = 0.45  # the farthest points turn to the ground's colour so far
 ELONGATED = 0.3  # a path this long, against the map's extent, is followed; else the map is viewed
-WIDEST = 0.4  # a path that strays this far aside, against its length, is no way to look along
 OUTSKIRTS = (0.05, 0.95)  # quantiles of the map a side: what is beyond need not be in the picture
-VIEW_NAMES = ("top", "perspective")
+VIEW_NAMES = ("top", "iso")
 
 
 def choose_view(name: str, scene: Scene, size: tuple[int, int]) -> View:
-    """The view called `name` ("top" or "perspective") for pictures of (width, height) pixels."""
+    """The view called `name` ("top" or "iso") for pictures of (width, height) pixels."""
     if name == "top":
         return top_view(scene, size)
-    if name == "perspective":
-        return perspective_view(scene, size)
+    if name == "iso":
+        return iso_view(scene, size)
     raise ValueError(f"choose_view: expected one of {', '.join(VIEW_NAMES)}, found '{name}'")
 
 
@@ -34,7 +38,7 @@ def top_view(scene: Scene, size: tuple[int, int]) -> View:
     right = _long_axis(scene)
     if size[1] > size[0]:
         right = np.cross(scene.up, right)
-    R = _axes(right, -scene.up)
+    R = view_axes(right, -scene.up)
     framed = _framed(scene) @ R.T
     low, high = framed.min(0), framed.max(0)
     span = np.maximum(high[:2] - low[:2], 0.1)
@@ -43,28 +47,42 @@ def top_view(scene: Scene, size: tuple[int, int]) -> View:
     path_depth = float(np.median(scene.path_m @ R[2]))
     centre = np.array([*((low + high) / 2.0)[:2], path_depth - height_m])
     focal = px_per_m * height_m
-    return View("top", size, _intrinsics(size, focal), _look(R, R.T @ centre), px_per_m)
+    return View("top", size, _intrinsics(size, focal), look_from(R, R.T @ centre), px_per_m)
 
 
-def perspective_view(scene: Scene, size: tuple[int, int]) -> View:
-    """From behind and above: along a long path from its start, or of the whole of a small map."""
+def iso_view(scene: Scene, size: tuple[int, int]) -> View:
+    """Of the whole from behind and above at an angle: the one of some that fills it the most.
+
+    The map is what the camera saw, so it is looked at from where the camera looked.
+    """
     focal = 0.5 * size[0] / np.tan(np.radians(FIELD_OF_VIEW_DEG) / 2.0)
     framed = _framed(scene)
-    start, across = scene.path_m[0], scene.path_m - scene.path_m[0]
+    along = _direction(scene, framed)
+    aside = np.cross(scene.up, along)
+    best, nearest_m = np.eye(4), np.inf
+    for angle in np.radians(AZIMUTHS_DEG):
+        flat = np.cos(angle) * along + np.sin(angle) * aside
+        elevation = np.radians(ELEVATION_DEG)
+        R = view_axes(
+            np.cross(flat, scene.up), np.cos(elevation) * flat - np.sin(elevation) * scene.up
+        )
+        T = _fit(R, framed, focal, size)
+        middle_m = float(np.median(transform_points(T, framed)[:, 2]))
+        if middle_m < 0.98 * nearest_m:
+            best, nearest_m = T, middle_m
+    depth = transform_points(best, framed)[:, 2]
+    haze = (float(np.quantile(depth, 0.3)), float(np.quantile(depth, 0.98)), HAZE)
+    return View("iso", size, _intrinsics(size, focal), best, haze=haze)
+
+
+def _direction(scene: Scene, framed: Array) -> Array:
+    """Where the camera went, made level; where it looked at first if it hardly went anywhere."""
+    across = scene.path_m - scene.path_m[0]
     across = across - np.outer(across @ scene.up, scene.up)
     reach = np.linalg.norm(across, axis=1)
-    length_m = float(reach.max())
-    along = across[int(reach.argmax())] / max(length_m, 1e-9)
-    aside_m = float(np.linalg.norm(across - np.outer(across @ along, along), axis=1).max())
-    is_long = length_m > ELONGATED * float(np.linalg.norm(np.ptp(framed, axis=0)))
-    if is_long and aside_m < WIDEST * length_m:
-        aside = np.cross(scene.up, along)
-        eye = start + length_m * (-0.34 * along + 0.17 * scene.up + 0.04 * aside)
-        target = start + 0.35 * length_m * along
-        return View("perspective", size, _intrinsics(size, focal), _look_at(eye, target, scene.up))
-    direction = _unit(0.87 * scene.forward - 0.50 * scene.up)
-    R = _axes(np.cross(scene.forward, scene.up), direction)
-    return View("perspective", size, _intrinsics(size, focal), _fit(R, framed, focal, size))
+    if reach.max() < ELONGATED * float(np.linalg.norm(np.ptp(framed, axis=0))):
+        return scene.forward
+    return _unit(across[int(reach.argmax())])
 
 
 def _framed(scene: Scene) -> Array:
@@ -106,21 +124,16 @@ def _fit(R: Array, framed: Array, focal: float, size: tuple[int, int]) -> Array:
         px = (local[:, :2] - centre[:2]) / depth * focal
         shift = (px.min(0) + px.max(0)) / 2.0
         centre[:2] += shift * np.median(depth) / focal
-    return _look(R, R.T @ np.array([centre[0], centre[1], -back]))
+    return look_from(R, R.T @ np.array([centre[0], centre[1], -back]))
 
 
-def _look_at(eye: Array, target: Array, up: Array) -> Array:
-    forward = _unit(target - eye)
-    return _look(_axes(np.cross(forward, up), forward), eye)
-
-
-def _axes(right: Array, forward: Array) -> Array:
+def view_axes(right: Array, forward: Array) -> Array:
     """Rows x, y, z of a camera that looks `forward` with `right` to its right."""
     x = _unit(right - forward * (right @ forward))
     return np.stack([x, np.cross(forward, x), forward])
 
 
-def _look(R: Array, eye: Array) -> Array:
+def look_from(R: Array, eye: Array) -> Array:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, -R @ eye
     return T

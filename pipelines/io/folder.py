@@ -76,6 +76,7 @@ def clear_result_folder(folder: Path | str) -> None:
     stale += [*(folder / FRONT_END).glob("*.*"), *(folder / FRONT_END / OBJECTS).glob("*_tum.txt")]
     for name in (FRAMES, PLOTS, RENDERS):
         stale += [*(folder / name).glob("*.png"), *(folder / name).glob("*.jpg")]
+    stale += (folder / RENDERS).glob("*.mp4")
     try:
         for path in stale:
             path.unlink(missing_ok=True)

@@ -79,6 +79,7 @@ def test_help_imports_nothing_heavy(repository: Path, argv) -> None:
         (["render", "--size", "1280"], "expected WIDTHxHEIGHT as in 1280x720, found '1280'"),
         (["render", "--size", "0x720"], "expected sides of 160 to 8192 pixels"),
         (["render", "--size", "99999x720"], "expected sides of 160 to 8192 pixels"),
+        (["render", "--view", "side"], "invalid choice: 'side'"),
         (["eval", "a", "b"], "'eval' does not know b"),
     ],
 )
@@ -134,9 +135,17 @@ def test_a_verb_runs_in_a_process_of_its_own(repository: Path) -> None:
 
 
 def test_render_offers_what_the_renderer_can_draw() -> None:
+    from viz.render import VIEW_NAMES
     from viz.style import BACKGROUNDS
-    from viz.views import VIEW_NAMES
 
     assert arguments.VIEWS == VIEW_NAMES
     for background in BACKGROUNDS:
         cli.build_parser().parse_args(["render", "--background", background])
+
+
+@pytest.mark.parametrize("line", ["--view top iso", "--view top --view iso"])
+def test_views_come_as_a_list_or_one_by_one(line: str) -> None:
+    arguments = cli.build_parser().parse_args(["render", *line.split()])
+    assert arguments.view == ["top", "iso"]
+    assert arguments.video is None
+    assert cli.build_parser().parse_args(["render", "x", "--video"]).video == "chase"

@@ -143,7 +143,25 @@ def test_the_demo_runs_renders_and_says_what_comes_next(calls, capsys, tmp_path)
 
 def test_render_hands_on_its_flags(calls, capsys, tmp_path) -> None:
     (tmp_path / "camera_tum.txt").write_text("")
-    line = f"render {tmp_path} --size 640x360 --views top --background black"
+    line = f"render {tmp_path} --size 640x360 --view top --background black --frame 7"
     assert runs.render(words(line)) == 0
     assert calls["rendered"] == tmp_path.resolve()
-    assert calls["options"] == {"size": (640, 360), "views": ("top",), "background": "black"}
+    options = {"size": (640, 360), "views": ("top",), "background": "black", "frame": 7}
+    assert calls["options"] == options
+    runs.render(words(f"render {tmp_path}"))
+    assert calls["options"]["views"] == ("top", "iso", "chase")
+
+
+def test_render_makes_a_video_where_one_is_asked_for(calls, capsys, tmp_path, monkeypatch) -> None:
+    seen: list[Any] = []
+    monkeypatch.setattr("viz.video.write_video", lambda *a, **o: seen.append((a, o)) or a[1])
+    monkeypatch.setitem(sys.modules, "viz.render", sys.modules["viz.render"])
+    sys.modules["viz.render"].renders_folder = lambda result: result.folder / "renders"
+    (tmp_path / "camera_tum.txt").write_text("")
+    runs.render(words(f"render {tmp_path} --size 640x360"))
+    assert seen == []
+    runs.render(words(f"render {tmp_path} --size 640x360 --video top"))
+    ((result, path), options) = seen[0]
+    assert result.folder == tmp_path.resolve() and path == result.folder / "renders" / "video.mp4"
+    assert (options["view"], options["width"], options["background"]) == ("top", 640, "white")
+    assert capsys.readouterr().out.splitlines()[-1].endswith("video.mp4")

@@ -69,7 +69,7 @@ def test_eval_restores_metrics_that_were_lost(result: Path) -> None:
 def test_render_draws_pictures_of_the_size_asked_for(result: Path) -> None:
     import cv2
 
-    done = app("render", result, "--size", "320x200")
+    done = app("render", result, "--size", "320x200", "--video")
     assert done.returncode == 0, done.stderr
     files = [Path(line) for line in done.stdout.splitlines() if line.endswith(".png")]
     diagrams = [file for file in files if file.parent.name == "plots"]
@@ -77,11 +77,17 @@ def test_render_draws_pictures_of_the_size_asked_for(result: Path) -> None:
     names = {"trajectory.png", "rpe.png", "timings.png", "objects_timeline.png"}
     assert {file.name for file in diagrams} == names
     maps = [file for file in files if file.parent.name == "renders"]
-    assert len(maps) == 2
+    assert len(maps) == 5
     for file in maps:
         image = cv2.imread(str(ROOT / file))
         assert image.shape == (200, 320, 3)
         assert image.std() > 1.0, f"{file} is empty"
+    (video,) = [Path(line) for line in done.stdout.splitlines() if line.endswith(".mp4")]
+    reader = cv2.VideoCapture(str(ROOT / video))
+    assert int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) == N_FRAMES
+    assert reader.get(cv2.CAP_PROP_FPS) == pytest.approx(10.0)
+    ok, first = reader.read()
+    assert ok and first.shape[1] == 320 and first.std() > 10.0
 
 
 def test_ctrl_c_leaves_a_valid_partial_result(tmp_path: Path) -> None:

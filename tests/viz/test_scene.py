@@ -7,6 +7,7 @@ import pytest
 
 from pipelines.geometry import exp_se3, transform_points
 from pipelines.io.result import Result
+from viz import style
 from viz.scene import build_scene, frustums, near_path, split_at_gaps
 from viz.views import VIEW_NAMES, choose_view
 
@@ -114,6 +115,24 @@ def test_almost_nothing_to_show(n):
         assert ((uv >= 0) & (uv < [320, 240])).all()
 
 
+def test_up_is_what_a_camera_in_a_hand_turns_about():
+    down = exp_se3(np.array([-0.5, 0.0, 0.0, 0.0, 0.0, 0.0]))  # it looks at a table all the time
+    turned = [exp_se3(np.array([0.0, a, 0, 0, 0, 0])) @ down for a in np.linspace(-0.6, 0.6, 30)]
+    Ts = np.linalg.inv(turned[0]) @ np.array(turned)
+    level = np.linalg.inv(turned[0])[:3, :3] @ [0.0, -1.0, 0.0]
+    up = build_scene(make_result(Ts)).up
+    assert up @ level > np.cos(np.radians(3.0))
+    assert -Ts[0, :3, 1] @ level < np.cos(np.radians(25.0))  # none of its own axes tells so
+
+
+def test_a_short_path_has_few_frustums():
+    Ts = drive(40)
+    Ts[:, :3, 3] *= 0.005
+    far = make_result(drive(40)).static_points_m
+    scene = build_scene(make_result(Ts, static_points_m=far, static_colors=np.uint8(far * 0)))
+    assert 1 <= sum(line.color == style.FRUSTUM for line in scene.polylines) <= 3
+
+
 def test_unknown_view():
-    with pytest.raises(ValueError, match="expected one of top, perspective, found 'side'"):
+    with pytest.raises(ValueError, match="expected one of top, iso, found 'side'"):
         choose_view("side", build_scene(make_result(drive(5))), (64, 48))
