@@ -53,6 +53,7 @@ def demo(arguments: Namespace) -> int:
     from pipelines.datasets import open_sequence
     from viz.plots import plot_result
     from viz.render import render_result
+    from viz.report import write_report
 
     quiet = arguments.quiet
     with console.counting("rendering the scene", quiet) as progress:
@@ -63,6 +64,7 @@ def demo(arguments: Namespace) -> int:
         return INTERRUPTED
     with console.warnings(), console.working("drawing the map and the trajectory", quiet):
         pictures = render_result(result.folder) + plot_result(result.folder)
+        pictures.append(write_report(result))
     console.pictures(pictures)
     if not quiet:
         if arguments.pictures:
@@ -81,10 +83,14 @@ def demo(arguments: Namespace) -> int:
 def evaluate(arguments: Namespace) -> int:
     """`eval RESULT`: renew metrics.json and metrics.txt from the trajectories, and show them."""
     from pipelines.evaluation import evaluate_result
+    from pipelines.io.folder import REPORT
     from pipelines.io.result import load_result
+    from viz.report import write_report
 
     metrics = evaluate_result(arguments.result)
     result = load_result(arguments.result)
+    if (result.folder / REPORT).exists():  # else `render` will write it
+        write_report(result)
     console.metrics(metrics, result.timings, console.shorten(result.folder))
     return 0
 
@@ -112,8 +118,10 @@ def optimize(arguments: Namespace) -> int:
 def render(arguments: Namespace) -> int:
     """`render RESULT`: PNG files in the result folder."""
     from pipelines.io.folder import open_result_folder
+    from pipelines.io.result import load_result
     from viz.plots import plot_result
     from viz.render import render_result
+    from viz.report import write_report
 
     folder = open_result_folder(arguments.result)
     with console.warnings(), console.working(f"drawing {console.shorten(folder)}"):
@@ -124,6 +132,7 @@ def render(arguments: Namespace) -> int:
             background=arguments.background,
         )
         pictures += plot_result(folder)
+        pictures.append(write_report(load_result(folder)))
     console.pictures(pictures)
     return 0
 

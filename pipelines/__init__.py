@@ -6,8 +6,12 @@
 Each name is loaded when first used, so that `import pipelines` costs nothing.
 """
 
+import os
 from importlib import import_module
 from typing import Any
+
+# Open3D would otherwise start a server in every notebook, and print that it does
+os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
 
 _PUBLIC = {
     "open_sequence": "pipelines.datasets",
