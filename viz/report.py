@@ -35,9 +35,10 @@ CAPTIONS = {
     "map_perspective": "The static map with the ways of the camera and of all that moved.",
     "trajectory": "The camera's path from above, and its distance to the truth.",
     "rpe": "Error of every single step of the camera.",
-    "timings": "What a frame costs, over time and by stage.",
     "objects_speed": "Speeds of moving objects: single frames, and the filter's 95 % interval.",
+    "objects_motion": "Errors of each moving object's motion in one frame.",
     "objects_timeline": "Which object was known when, and whether it moved.",
+    "timings": "What a frame costs, over time and by stage.",
 }
 
 
@@ -200,7 +201,7 @@ def _timings(result: Result) -> Html:
 
 
 def _images(folder: Path) -> list[Path]:
-    """Pictures in a folder, those with a caption first and in its order."""
+    """Pictures in a folder, those that this program makes first and in their order."""
     found = {path.stem: path for path in sorted(folder.glob("*.png"))}
     known = [found.pop(stem) for stem in CAPTIONS if stem in found]
     return [*known, *found.values()]

@@ -26,9 +26,10 @@ from pipelines.types import (
 from viz import style
 from viz.overlay import write_image
 from viz.playback import build_playback
-from viz.plots import plot_result
+from viz.plots import PLOTS, plot_result
 from viz.report import write_report
 from viz.report_objects import summarise_objects
+from viz.views import VIEW_NAMES
 
 N = 12
 STEP = exp_se3(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))  # of the car: 36 km/h at 10 frames/s
@@ -148,6 +149,10 @@ def test_the_page_tells_what_the_folder_holds(tmp_path, scene):
     for link in re.findall(r'<a href="([^"]+)"', page):
         assert (folder / link).exists(), link
     assert 'srcdoc="&lt;!doctype html&gt;&lt;p id=&quot;inner&quot;&gt;' in page
+
+
+def test_each_picture_that_is_made_has_its_words():
+    assert set(viz.report.CAPTIONS) == {*PLOTS, *(f"map_{name}" for name in VIEW_NAMES)}
 
 
 def test_nothing_comes_from_outside(tmp_path, scene):
