@@ -249,6 +249,14 @@ def _add_train_vocabulary(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_notebook(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "name", metavar="NAME", nargs="?", help="which one, by how its name begins (default: 01)"
+    )
+    parser.add_argument("--no-browser", action="store_true", help="only print the address")
+    parser.add_argument("--port", type=_positive, metavar="N", help="default: the first free one")
+
+
 def _add_test(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "pytest_arguments", metavar="ARGUMENT", nargs="*", help="handed on to pytest"
@@ -301,5 +309,6 @@ ADDERS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     "config": _add_settings,
     "datasets": _add_datasets,
     "models": _add_models,
+    "notebook": _add_notebook,
     "test": _add_test,
 }

@@ -128,6 +128,14 @@ models add yolo_seg yolov8n-seg.onnx
 models export mask_rcnn --weights my.pth --unchecked
 models train-vocabulary IMAGES simulated:room --output my_words.npz""",
     ),
+    "notebook": Verb(
+        "app.notebook:notebook",
+        "open the notebooks in JupyterLab",
+        """\
+notebook                        # the walk-through; its address is printed
+notebook 02 --no-browser""",
+        (CORE, NOTEBOOK),
+    ),
     "test": Verb(
         "app.checks:test",
         "run the linters, the type checker and the tests",

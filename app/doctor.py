@@ -111,7 +111,7 @@ def _packages(environment: Environment) -> Iterator[Finding]:
             words = "not set up yet; 'python3 -m app demo' does it"
             yield Finding(Verdict.NOTE, f"packages: {section}", words)
         else:
-            who = "'python3 -m app test'"
+            who = f"'python3 -m app {'notebook' if section == NOTEBOOK else 'test'}'"
             who += " or what first needs them" if section == TORCH else ""
             words = f"not installed; {who} brings them"
             yield Finding(Verdict.NOTE, f"packages: {section}", words)

@@ -61,10 +61,9 @@ def demo(arguments: Namespace) -> int:
     """`demo`: a small simulated sequence, its result, its pictures, and what to do next."""
     from pipelines.config import load_config
     from pipelines.datasets import open_sequence
-    from pipelines.io import folder as names
-    from viz.browser import export_scene
     from viz.plots import plot_result
     from viz.render import render_result
+    from viz.report import write_report
 
     quiet = arguments.quiet
     with console.counting("rendering the scene", quiet) as progress:
@@ -75,7 +74,7 @@ def demo(arguments: Namespace) -> int:
         return INTERRUPTED
     with console.warnings(), console.working("drawing the map and the trajectory", quiet):
         pictures = render_result(result.folder) + plot_result(result.folder)
-        pictures.append(export_scene(result, result.folder / names.SCENE))
+        pictures.append(write_report(result))
     console.pictures(pictures)
     if not quiet:
         if arguments.pictures:
@@ -96,10 +95,14 @@ def demo(arguments: Namespace) -> int:
 def evaluate(arguments: Namespace) -> int:
     """`eval RESULT`: renew metrics.json and metrics.txt from the trajectories, and show them."""
     from pipelines.evaluation import evaluate_result
+    from pipelines.io.folder import REPORT
     from pipelines.io.result import load_result
+    from viz.report import write_report
 
     metrics = evaluate_result(arguments.result)
     result = load_result(arguments.result)
+    if (result.folder / REPORT).exists():  # else `render` will write it
+        write_report(result)
     console.metrics(metrics, result.timings, console.shorten(result.folder))
     return 0
 
@@ -126,12 +129,11 @@ def optimize(arguments: Namespace) -> int:
 
 def render(arguments: Namespace) -> int:
     """`render RESULT`: pictures in the result folder, the scene as a page, a video on demand."""
-    from pipelines.io import folder as names
     from pipelines.io.folder import open_result_folder
     from pipelines.io.result import load_result
-    from viz.browser import export_scene
     from viz.plots import plot_result
     from viz.render import render_result
+    from viz.report import write_report
 
     folder = open_result_folder(arguments.result)
     options = {"size": arguments.size, "background": arguments.background}
@@ -140,7 +142,7 @@ def render(arguments: Namespace) -> int:
             folder, **options, views=tuple(arguments.view or VIEWS), frame=arguments.frame
         )
         pictures += plot_result(folder)
-        pictures.append(export_scene(load_result(folder), folder / names.SCENE))
+        pictures.append(write_report(load_result(folder)))
     if arguments.video:
         pictures.append(_video(folder, arguments))
     console.pictures(pictures)

@@ -55,7 +55,13 @@ class DyObSlam:
     """Dynamic-object SLAM of one camera, frame by frame.
 
     >>> slam = DyObSlam(sequence.camera)
-    >>> result = slam.process(sequence.read(0))
+    >>> for index in range(len(sequence)):
+    ...     result = slam.process(sequence.read(index))
+    ...     result.T_world_camera, result.objects.object_id, result.objects.speed_mps
+    >>> slam.static_map().points_m
+    >>> slam.close()
+
+    It knows no files and no ground truth; `run` adds them, and the global batch at the end.
     """
 
     def __init__(
@@ -65,9 +71,12 @@ class DyObSlam:
         known_map: SparseMap | None = None,
         localize: bool = False,
     ) -> None:
-        """known_map: of an earlier run, whose world holds; it is continued, and so it changes.
+        """A system that has seen nothing yet.
 
-        Every frame is LOST then until one is recognised in it. localize: the map is only read.
+        camera: of all frames to come, as `sequence.camera`. config: all settings; the default ones
+        where None. known_map: of an earlier run, whose world holds; it is continued, and so it
+        changes. Every frame is LOST then until one is recognised in it. localize: the map is only
+        read.
         Raises ValueError for localize without a map, FormatError for a damaged vocabulary.
         """
         if localize and known_map is None:
@@ -100,7 +109,8 @@ class DyObSlam:
     def process(self, frame: Frame | PreparedFrame) -> FrameResult:
         """Track one frame: camera, objects, map. Frames must come in order of time.
 
-        A frame that `prepare` has had before, in another thread say, is not prepared again.
+        A frame that `prepare` has had before, in another thread say, is not prepared again. Losing
+        track is no error but the result's status. Raises as `prepare`.
         """
         prepared = self.prepare(frame) if isinstance(frame, Frame) else frame
         self._timings_ms = dict(prepared.timings_ms)

@@ -88,12 +88,18 @@ def run(
 ) -> Result:
     """Run the whole system on a sequence and return its result folder, read back.
 
-    output: the folder to write; by default a new one under `results`, with a `latest` link.
-    start, frames, stride: which frames to take, all by default. batch_progress: called with (done,
-    total) while the batch at the end runs. lasting_map: the map that the run begins with, and where
-    to leave its own, as the front-end made it. A frame that cannot be read is skipped with a
-    warning. Ctrl-C ends the run early with a valid, partial result. Raises
-    DatasetError where no frame is asked for or none can be read, and as `LastingMap.open`.
+    >>> result = run(open_sequence("path/to/data"))
+    >>> result.folder, result.Ts_world_camera.shape, result.objects.speed_mps
+
+    config: all settings; the default ones where None, others by `pipelines.config.load_config`.
+    output: the folder to write; by default a new one under `results`, with a `latest` link. Files
+    of an earlier run in it are replaced. start, frames, stride: which frames to take, all by
+    default. sinks: what watches the run, see `Sink`. batch_progress: called with (done, total)
+    while the batch at the end runs. lasting_map: the map that the run begins with, and where to
+    leave its own, as the front-end made it. A frame that cannot be read is skipped with a warning.
+    Ctrl-C ends the run early with a valid, partial result. Raises DatasetError where no frame is
+    asked for or none can be read, ModelError where a network's file is missing, DyObError where the
+    disk refuses, and as `LastingMap.open`.
     """
     lasting_map = lasting_map or LastingMap()
     config = lasting_map.settings(config or Config())

@@ -149,7 +149,7 @@ def plot_object_motion(figure: Any, result: Result) -> None:
         for row, value in enumerate(rmse):
             at = (ends[row], row)
             axes.annotate(two_digits(value), at, (5, 0), textcoords="offset points", va="center")
-        axes.set(xlabel=words, xlim=(0.0, 1.2 * max(ends)), ylim=(len(shown) - 0.4, -0.6))
+        axes.set(xlabel=words, xlim=(0.0, 1.2 * max(*ends, 1e-9)), ylim=(len(shown) - 0.4, -0.6))
         axes.grid(visible=False, axis="y")
     left.set_yticks(range(len(labels)), labels)
     right.tick_params(labelleft=False)

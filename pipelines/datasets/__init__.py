@@ -48,12 +48,17 @@ def load_dataset(dataset: str) -> Any:
 def open_sequence(
     path: Path | str, dataset: str | None = None, name: str | None = None, **options: Any
 ) -> Sequence:
-    """The sequence in a folder or a video file.
+    """The sequence in a folder or a video file, or a rendered one such as "simulated:demo".
 
-    dataset: a name of the table; guessed from the folder where None. name: a sequence inside a
-    folder of several, as a sub-folder of `path` or of `path`/sequences, or as the layout names it.
-    options: of that data set. Raises DatasetError that says what trees are expected and what was
-    found.
+    >>> sequence = open_sequence("path/to/data")
+    >>> len(sequence), sequence.camera, sequence.timestamps_s.shape
+    >>> frame = sequence.read(0)  # image, and what there is of depth, right image, flow, masks
+
+    dataset: a name of the table `DATASETS`; guessed from the folder where None. name: a sequence
+    inside a folder of several, as a sub-folder of `path` or of `path`/sequences, or as the layout
+    names it. options: of that data set, such as depth_scale= and fps= of `folder`, or frames=,
+    degrade= and provide= of `simulated`. Raises DatasetError that says which files were expected
+    and what was found, ConfigError for an option of a wrong value.
     """
     if name is not None:
         holder = _holder_of_sequences(Path(path), dataset)

@@ -31,7 +31,8 @@ FRONT_END = "front_end"  # a folder: what the batch started from
 FRAMES = "frames"
 PLOTS = "plots"
 RENDERS = "renders"
-SCENE = "scene.html"
+SCENE = "scene.html"  # the run in 3D, a page of its own
+REPORT = "report.html"
 LATEST = "latest"
 
 logger = logging.getLogger("dyob.io")
@@ -69,7 +70,7 @@ def clear_result_folder(folder: Path | str) -> None:
     folder = Path(folder)
     check_output(folder, LOG)
     files = [CONFIG, LOG, CAMERA_TUM, CAMERA_KITTI, CAMERA_GT_TUM, STATIC_MAP]
-    files += [OBJECTS_CSV, OBJECTS_GT_CSV, CAMERA_STD, SCENE]
+    files += [OBJECTS_CSV, OBJECTS_GT_CSV, CAMERA_STD, SCENE, REPORT]
     stale = [folder / name for name in (*files, METRICS_JSON, METRICS_TXT, TIMINGS)]
     stale += (folder / OBJECTS).glob("*_tum.txt")
     stale += [*(folder / OBSERVATIONS).glob("*.npz"), *(folder / OBSERVATIONS).glob("*.json")]

@@ -150,9 +150,12 @@ class _LogFile(logging.FileHandler):
 class Result:
     """A result folder in memory.
 
-    timestamps_s: (N,) and Ts_world_camera: (N, 4, 4) of the measured frames. The same of the truth
-    in our world, or None. static_points_m: (M, 3) float64, static_colors: (M, 3) uint8 RGB.
-    objects: all rows of objects.csv. gt_objects: the true ones in our world, or None.
+    timestamps_s: (N,) and Ts_world_camera: (N, 4, 4) of the measured frames. gt_timestamps_s,
+    gt_Ts_world_camera: the same of the truth in our world, or None. (M, 3)
+    float64 in the world, static_colors: (M, 3) uint8 RGB. metrics: metrics.json, with the blocks
+    "run", and "camera", "objects", "batch" where there are such. timings: timings.json, ms a stage.
+    config: config.yaml. objects: all rows of objects.csv. gt_objects: the true ones in our world,
+    or None.
     """
 
     folder: Path
@@ -171,6 +174,9 @@ class Result:
 
 def load_result(path: Path | str) -> Result:
     """Read a result folder, or the `latest` link to one.
+
+    >>> result = load_result("results/latest")
+    >>> moving = result.objects[result.objects.state == "moving"]
 
     Only camera_tum.txt must be there: what an interrupted run did not write is empty or None.
     Raises FormatError where the folder is none or one of its files is damaged.

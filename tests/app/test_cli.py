@@ -116,7 +116,7 @@ def test_what_follows_test_goes_to_pytest_in_order(monkeypatch, words) -> None:
     monkeypatch.setattr(bootstrap, "prepare", lambda argv, sections: seen.append(sections))
     monkeypatch.setattr("app.checks.test", lambda arguments: seen.append(arguments) or 0)
     cli.main(["test", "--debug", *words])
-    assert seen[0] == ("core", "development", "torch")  # without torch its tests would skip
+    assert seen[0] == ("core", "development", "notebook", "torch")  # else their tests would skip
     assert seen[1].pytest_arguments == words
 
 

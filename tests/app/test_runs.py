@@ -39,15 +39,11 @@ def calls(monkeypatch, tmp_path) -> dict[str, Any]:
     def plot_result(folder):
         return [Path(folder) / "plots" / "trajectory.png"]
 
-    def export_scene(result, path):
-        return Path(path)
+    def write_report(result):
+        return tmp_path / "report.html"
 
-    stand_ins = {
-        "pipelines.runner": run,
-        "viz.render": render_result,
-        "viz.plots": plot_result,
-        "viz.browser": export_scene,
-    }
+    stand_ins = {"pipelines.runner": run, "viz.render": render_result, "viz.plots": plot_result}
+    stand_ins["viz.report"] = write_report
     for name, function in stand_ins.items():
         module = ModuleType(name)
         setattr(module, function.__name__, function)
@@ -137,7 +133,7 @@ def test_the_demo_runs_renders_and_says_what_comes_next(calls, capsys, tmp_path)
     assert calls["span"] == {"frames": 4}
     assert calls["rendered"] == tmp_path
     said = capsys.readouterr().out
-    assert "top.png" in said
+    assert "top.png" in said and "report.html" in said
     assert "python3 -m app run PATH" in said
 
 

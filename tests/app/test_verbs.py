@@ -74,8 +74,8 @@ def test_render_draws_pictures_of_the_size_asked_for(result: Path) -> None:
     files = [Path(line) for line in done.stdout.splitlines() if line.endswith(".png")]
     diagrams = [file for file in files if file.parent.name == "plots"]
     # No speeds: four steps are too few to draw
-    names = {"trajectory.png", "rpe.png", "timings.png", "objects_timeline.png"}
-    assert {file.name for file in diagrams} == names
+    names = {"trajectory", "rpe", "timings", "objects_timeline", "objects_motion"}
+    assert {file.stem for file in diagrams} == names
     maps = [file for file in files if file.parent.name == "renders"]
     assert len(maps) == 5
     for file in maps:
@@ -88,6 +88,14 @@ def test_render_draws_pictures_of_the_size_asked_for(result: Path) -> None:
     assert reader.get(cv2.CAP_PROP_FPS) == pytest.approx(10.0)
     ok, first = reader.read()
     assert ok and first.shape[1] == 320 and first.std() > 10.0
+    assert done.stdout.splitlines()[-1].endswith("report.html")
+
+
+def test_eval_renews_the_report_where_there_is_one(result: Path) -> None:
+    report = result / "report.html"
+    report.write_text("of an earlier evaluation")
+    assert app("eval", result).returncode == 0
+    assert "ATE, SE(3) aligned" in report.read_text(encoding="utf-8")
 
 
 def test_ctrl_c_leaves_a_valid_partial_result(tmp_path: Path) -> None:

@@ -5,7 +5,9 @@ Owns no accuracy; imports of the other tests cannot help these scripts.
 
 from __future__ import annotations
 
+import inspect
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -92,3 +94,14 @@ def test_the_names_are_the_four(tmp_path) -> None:
 def test_importing_the_package_loads_nothing_heavy() -> None:
     script = "import sys, pipelines; print(sorted({'numpy', 'cv2', 'open3d'} & set(sys.modules)))"
     assert execute(script, ROOT / "tests") == ["[]"]
+
+
+@pytest.mark.parametrize("name", pipelines.__all__)
+def test_help_shows_each_name_with_an_example_and_what_goes_wrong(name: str) -> None:
+    public = getattr(pipelines, name)
+    assert name in dir(pipelines) and name in (pipelines.__doc__ or "")
+    words = public.__doc__ + (public.__init__.__doc__ if isinstance(public, type) else "")
+    assert ">>> " in words and re.search(r"Raises\s+\w+Error", words)
+    signature = inspect.signature(public.__init__ if isinstance(public, type) else public)
+    untyped = [p.name for p in signature.parameters.values() if p.annotation is p.empty]
+    assert untyped in ([], ["self"]) and signature.return_annotation is not signature.empty
