@@ -142,9 +142,9 @@ def render(arguments: Namespace) -> int:
             folder, **options, views=tuple(arguments.view or VIEWS), frame=arguments.frame
         )
         pictures += plot_result(folder)
-        pictures.append(write_report(load_result(folder)))
     if arguments.video:
         pictures.append(_video(folder, arguments))
+    pictures.append(write_report(load_result(folder)))
     console.pictures(pictures)
     return 0
 

@@ -25,6 +25,7 @@ from viz.report_run import files_section, settings_section
 
 LARGEST_BYTES = 12_000_000
 SCENE_HEIGHT_PX = 560
+SMALL_SCENE_MB = 5.0
 N_FRAMES = 4
 KEY_OF_FRAMES = (
     "Green rings agree with the camera's pose, red crosses do not. What moves has a box and its "
@@ -32,10 +33,8 @@ KEY_OF_FRAMES = (
 )
 CAPTIONS = {
     "map_top": "The static map from above, with the ways of the camera and of all that moved.",
-    "map_iso": "The static map with the ways of the camera and of all that moved.",
-    "map_chase": "What moved around the camera in one moment.",
-    "static_top": "The sparse static map from above.",
-    "static_iso": "The sparse static map.",
+    "map_iso": "The same from the side.",
+    "map_chase": "One moment from behind the camera: objects in their boxes, over the map.",
     "trajectory": "The camera's path from above, and its distance to the truth.",
     "rpe": "Error of every single step of the camera.",
     "objects_speed": "Speeds of moving objects: single frames, and the filter's 95 % interval.",
@@ -46,7 +45,7 @@ CAPTIONS = {
 
 
 def write_report(result: Result) -> Path:
-    """Write report.html into a result's folder; its path.
+    """Write report.html into a result's folder, and scene.html beside it; the path of the first.
 
     The page stands alone: pictures are inside, nothing is fetched. It shows the renders, plots and
     annotated frames that are in the folder, so make these first. What a run lacks (truth, objects,
@@ -111,13 +110,16 @@ def _headline(result: Result) -> Html:
 
 
 def _scene(result: Result, n_bytes: int) -> Html:
-    """The run in 3D, which is scene.html too; a link where the page would grow too large by it."""
+    """The run in 3D, which is scene.html too; with fewer pictures where the page grew too large."""
     from viz.browser import scene_html
 
     page = scene_html(result)
     write_text(result.folder / names.SCENE, page)
     frame = page_frame(page, SCENE_HEIGHT_PX, "The run in 3D")
-    if n_bytes + len(frame) < LARGEST_BYTES:
+    if n_bytes + len(frame) > LARGEST_BYTES:
+        page = scene_html(result, max_mb=SMALL_SCENE_MB)
+        frame = page_frame(page, SCENE_HEIGHT_PX, "The run in 3D")
+    if n_bytes + len(frame) <= LARGEST_BYTES:
         body = f'<div class="scene">{frame}</div>'
         body += '<p class="soft">Turn it with the mouse or a finger; play it with the slider.</p>'
     else:
@@ -130,8 +132,11 @@ def _pictures(result: Result, playback: Playback) -> Html:
     """The map, and the frames in which most moves."""
     body = "".join(
         figure(path, CAPTIONS.get(path.stem, _title(path)), photo=True)
-        for path in _images(result.folder / names.RENDERS)
+        for path in _images(result.folder / names.RENDERS, "map_*.png")
     )
+    for path in sorted((result.folder / names.RENDERS).glob("*.mp4")):
+        address = f"{names.RENDERS}/{path.name}"
+        body += f'<p>The run as a video, beside this page: <a href="{address}">{address}</a></p>'
     if body:
         body = f"<h2>Map</h2>{body}"
     chosen = _telling_frames(playback)
@@ -185,7 +190,7 @@ def _padded(rows: Iterable[words.Row]) -> list[words.Row]:
 
 
 def _plots(result: Result) -> Html:
-    paths = _images(result.folder / names.PLOTS)
+    paths = _images(result.folder / names.PLOTS, "*.png")
     if not paths:
         return Html("")
     body = "".join(figure(path, CAPTIONS.get(path.stem, _title(path))) for path in paths)
@@ -203,9 +208,9 @@ def _timings(result: Result) -> Html:
     return Html(f"<section><h2>Run</h2>{body}</section>")
 
 
-def _images(folder: Path) -> list[Path]:
+def _images(folder: Path, pattern: str) -> list[Path]:
     """Pictures in a folder, those that this program makes first and in their order."""
-    found = {path.stem: path for path in sorted(folder.glob("*.png"))}
+    found = {path.stem: path for path in sorted(folder.glob(pattern))}
     known = [found.pop(stem) for stem in CAPTIONS if stem in found]
     return [*known, *found.values()]
 
