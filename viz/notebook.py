@@ -14,7 +14,7 @@ from pipelines.io.result import Result
 from pipelines.types import Image
 from viz import markup
 
-_PICTURE_STYLE = "<style>figure img {width: 100%; max-width: 1242px}</style>"
+_PICTURE_STYLE = "<style>figure {margin: 0} figure img {width: 100%; max-width: 1242px}</style>"
 
 
 def show_picture(picture: Image | Path | str, caption: str = "") -> Any:
