@@ -136,7 +136,7 @@ def draw_title(picture: Image, view: View, lines: list[str], *, dark: bool = Fal
     widths = [style.text_size(*args)[0] for args in zip(lines, sizes, weights, strict=True)]
     height = sum(round(1.45 * size) for size in sizes)
     pad = round(0.6 * text_px)
-    box = (margin - pad, margin - pad, margin + max(widths) + pad, margin + height + pad // 2)
+    box = (0, 0, margin + max(widths) + pad, margin + height + pad // 2)
     style.draw_panel(picture, box, panel)
     v = margin
     for line, size, weight in zip(lines, sizes, weights, strict=True):
@@ -163,7 +163,9 @@ def draw_key(
     top = view.size[1] - margin - step * len(key)
     pad = round(0.6 * text_px)
     left_px = view.size[0] - margin - width if at_right else margin
-    box = (left_px - pad, top - pad // 2, left_px + width, view.size[1] - margin + pad)
+    # Panels reach to the picture's edge, so that no stump of a line peeps out beside them.
+    sides = (left_px - pad, view.size[0]) if at_right else (0, left_px + width)
+    box = (sides[0], top - pad // 2, sides[1], view.size[1])
     style.draw_panel(picture, box, panel)
     for row, entry in enumerate(key):
         v = top + row * step + step // 2
