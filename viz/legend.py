@@ -49,8 +49,18 @@ def draw_legend(
     ]
     taken = _draw_ends(picture, scene, view, dark)
     taken.append(draw_title(picture, view, title_lines(result), dark=dark))
-    at_right = _is_left_crowded(scene, view, len(key))
-    taken += draw_key(picture, view, key, at_right=at_right, dark=dark)
+    return taken + draw_key_and_scale(picture, view, key, scene, dark=dark)
+
+
+def draw_key_and_scale(
+    picture: Image, view: View, key: Sequence[KeyEntry], scene: Scene, *, dark: bool = False
+) -> list[Box]:
+    """Legend at the bottom left, or right where paths lead through there; scale bar opposite.
+
+    A view that follows the camera has it at the left always. Returns the parts that they take.
+    """
+    at_right = not view.follows and _is_left_crowded(scene, view, len(key))
+    taken = draw_key(picture, view, key, at_right=at_right, dark=dark)
     if view.px_per_m is not None:
         taken.append(_draw_scale_bar(picture, view, dark, at_left=at_right))
     return taken
