@@ -38,9 +38,11 @@ def draw_box_labels(
 ) -> None:
     """Words above the boxes, in place, those of what moves first; `taken` stays free of them."""
     rank = {str(state): n for n, state in enumerate(ORDER)}
-    taken = list(taken)
-    for box in sorted(_shown(view, boxes), key=lambda b: rank[b.state]):
-        _draw_label(picture, view, box, taken, text_px)
+    taken, shown = list(taken), _shown(view, boxes)
+    movers = {b.object_id: _outline(view, b) for b in shown if b.state == str(ObjectState.MOVING)}
+    for box in sorted(shown, key=lambda b: rank[b.state]):
+        others = [part for number, part in movers.items() if part and number != box.object_id]
+        _draw_label(picture, view, box, taken, others, text_px)
 
 
 def _shown(view: View, boxes: Sequence[ObjectBox]) -> list[ObjectBox]:
@@ -79,28 +81,42 @@ def _draw_box(picture: Image, view: View, box: ObjectBox, dark: bool) -> None:
         draw_segment(picture, view, uv[[a, b]], color, width, dashed=dashed)
 
 
-def _draw_label(picture: Image, view: View, box: ObjectBox, taken: list[Box], text_px: int) -> None:
-    """The words above the box, else near it; those of what does not move only where it is large."""
+def _draw_label(
+    picture: Image,
+    view: View,
+    box: ObjectBox,
+    taken: list[Box],
+    others: list[Box],
+    text_px: int,
+) -> None:
+    """The words above the box, else near it; those of what does not move only where it is large.
+
+    Rather a place that hides no other moving object, but rather such a one than none.
+    """
     outline = _outline(view, box)
     assert outline is not None
-    u0, v0, u1, v1 = outline
     moves = box.state == str(ObjectState.MOVING)
     size_px = text_px if moves else max(10, round(0.85 * text_px))
-    if not moves and v1 - v0 < 1.6 * size_px:
+    if not moves and outline[3] - outline[1] < 1.6 * size_px:
         return
-    W, H = view.size
     width = style.text_size(box.words, size_px, 600 if moves else 400)[0]
     w, h = width + round(0.7 * size_px) + (0 if moves else 3), round(1.4 * size_px)
-    left = round((u0 + u1 - w) / 2)
-    rows = [v0 - h - 3, v0 - 2 * h - 5, v1 + 3, v0 - 3 * h - 7]
-    for top in rows if moves else rows[:1]:
-        for wanted in (left, u0, u1 - w):
-            u = int(np.clip(wanted, 0, max(W - w, 0)))
-            place = (u, top, u + w, top + h)
-            if top >= 0 and place[3] <= H and not overlaps(place, taken):
-                taken.append(place)
-                _write(picture, place, box, size_px, moves)
-                return
+    places = [p for p in _places(view, outline, (w, h)) if not overlaps(p, taken)]
+    clear = [place for place in places if not overlaps(place, others)]
+    if place := next(iter(clear or (places if moves else [])), None):
+        taken.append(place)
+        _write(picture, place, box, size_px, moves)
+
+
+def _places(view: View, outline: Box, size: tuple[int, int]) -> list[Box]:
+    """Above, below, beside, then further above and below; those that lie in the picture."""
+    (u0, v0, u1, v1), (w, h), (W, H) = outline, size, view.size
+    columns = ((u0 + u1 - w) // 2, u0, u1 - w)
+    near = [(u, v) for v in (v0 - h - 3, v1 + 3) for u in columns]
+    beside = [(u1 + 4, (v0 + v1 - h) // 2), (u0 - w - 4, (v0 + v1 - h) // 2)]
+    far = [(u, v) for v in (v0 - 2 * h - 5, v1 + h + 5, v0 - 3 * h - 7) for u in columns]
+    pushed = [(min(max(u, 0), max(W - w, 0)), v) for u, v in near + beside + far]
+    return [(u, v, u + w, v + h) for u, v in pushed if v >= 0 and v + h <= H]
 
 
 def _write(picture: Image, place: Box, box: ObjectBox, size_px: int, moves: bool) -> None:

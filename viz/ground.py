@@ -15,6 +15,7 @@ from viz.scene import View
 from viz.smoothing import smoothed
 
 LOWEST = 0.04  # quantile of the points' heights about the camera: that is where the ground is
+MOST_MEASURED = 200  # frames; what lies between is interpolated
 ABOUT = 1.5  # reaches round the camera in which points tell of the ground
 STEP, SPAN = 0.25, 3.0  # reaches: most that the lines are apart, and how far they go
 STEPS_M = tuple(base * 10.0**power for power in range(-3, 4) for base in (1, 2, 5))
@@ -26,7 +27,9 @@ def ground_levels_m(playback: Playback, reach_m: float) -> Array:
     scene = playback.scene
     heights = scene.points_m @ scene.up
     levels = np.full(len(playback), np.nan)
-    for k, center in enumerate(playback.Ts_world_camera[:, :3, 3]):
+    measured = np.linspace(0, max(len(playback) - 1, 0), min(len(playback), MOST_MEASURED))
+    for k in np.unique(measured.astype(int)).tolist():
+        center = playback.Ts_world_camera[k, :3, 3]
         apart = scene.points_m - center
         near = (apart * apart).sum(1) < (ABOUT * reach_m) ** 2
         near &= heights < center @ scene.up

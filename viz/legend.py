@@ -49,8 +49,18 @@ def draw_legend(
     ]
     taken = _draw_ends(picture, scene, view, dark)
     taken.append(draw_title(picture, view, title_lines(result), dark=dark))
-    at_right = _is_left_crowded(scene, view, len(key))
-    taken += draw_key(picture, view, key, at_right=at_right, dark=dark)
+    return taken + draw_key_and_scale(picture, view, key, scene, dark=dark)
+
+
+def draw_key_and_scale(
+    picture: Image, view: View, key: Sequence[KeyEntry], scene: Scene, *, dark: bool = False
+) -> list[Box]:
+    """Legend at the bottom left, or right where paths lead through there; scale bar opposite.
+
+    A view that follows the camera has it at the left always. Returns the parts that they take.
+    """
+    at_right = not view.follows and _is_left_crowded(scene, view, len(key))
+    taken = draw_key(picture, view, key, at_right=at_right, dark=dark)
     if view.px_per_m is not None:
         taken.append(_draw_scale_bar(picture, view, dark, at_left=at_right))
     return taken
@@ -136,7 +146,7 @@ def draw_title(picture: Image, view: View, lines: list[str], *, dark: bool = Fal
     widths = [style.text_size(*args)[0] for args in zip(lines, sizes, weights, strict=True)]
     height = sum(round(1.45 * size) for size in sizes)
     pad = round(0.6 * text_px)
-    box = (margin - pad, margin - pad, margin + max(widths) + pad, margin + height + pad // 2)
+    box = (0, 0, margin + max(widths) + pad, margin + height + pad // 2)
     style.draw_panel(picture, box, panel)
     v = margin
     for line, size, weight in zip(lines, sizes, weights, strict=True):
@@ -163,7 +173,9 @@ def draw_key(
     top = view.size[1] - margin - step * len(key)
     pad = round(0.6 * text_px)
     left_px = view.size[0] - margin - width if at_right else margin
-    box = (left_px - pad, top - pad // 2, left_px + width, view.size[1] - margin + pad)
+    # Panels reach to the picture's edge, so that no stump of a line peeps out beside them.
+    sides = (left_px - pad, view.size[0]) if at_right else (0, left_px + width)
+    box = (sides[0], top - pad // 2, sides[1], view.size[1])
     style.draw_panel(picture, box, panel)
     for row, entry in enumerate(key):
         v = top + row * step + step // 2

@@ -28,7 +28,7 @@ logger = logging.getLogger("dyob.viz")
 
 TIMEOUT_S = 180.0  # for one picture
 SUPERSAMPLING = 2
-CORNERS = 8  # of the discs
+CORNERS = 12  # of the discs
 ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -129,7 +129,7 @@ def _encoded(color: Array) -> Array:
 def _disc_mesh(
     view: View, points_m: Array, colors: NDArray[np.uint8], radius_m: float, background: Color
 ) -> Any:
-    """An octagon that faces the view at every point: Open3D's own points are squares of one size.
+    """A polygon that faces the view at every point: Open3D's own points are squares of one size.
 
     It is darker at its corners, like a ball. None where no point lies in the picture.
     """

@@ -16,10 +16,10 @@ from pipelines.io.files import disk_error
 from pipelines.io.result import Result, load_result
 from pipelines.types import Image
 from viz.chase import chase_views, telling_frame
-from viz.legend import draw_legend, draw_points_legend
+from viz.legend import draw_key_and_scale, draw_legend, draw_points_legend
 from viz.lines import draw_polyline
 from viz.moment import build_stage, draw_moment, draw_moment_labels
-from viz.moment_legend import draw_moment_legend, moment_key
+from viz.moment_legend import draw_moment_title, moment_key
 from viz.overlay import write_image
 from viz.playback import Playback, build_playback
 from viz.points import check_names, draw_points
@@ -72,8 +72,9 @@ def render_result(
         if view.name == "chase":
             stage = build_stage(playback)
             draw_moment(picture, view, stage, k, dark=dark)
-            key = moment_key(stage, playback.boxes[k])
-            taken = draw_moment_legend(picture, view, result, stage, k, key, dark=dark)
+            taken = [draw_moment_title(picture, view, result, playback, k, dark=dark)]
+            key = moment_key(stage, view, playback.boxes[k])
+            taken += draw_key_and_scale(picture, view, key, playback.scene, dark=dark)
             draw_moment_labels(picture, view, playback, k, taken)
         else:
             alone = picture.copy()

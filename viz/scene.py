@@ -60,6 +60,11 @@ class View:
     near_m: float = 1e-3
     haze: tuple[float, float, float] | None = None
 
+    @property
+    def follows(self) -> bool:
+        """Whether it is another one in each frame of a run."""
+        return self.name == "chase"
+
     def project(self, points_m: Array) -> tuple[Array, Array]:
         """Pixels (N, 2) and depths (N,) in metres of world points (N, 3)."""
         camera = transform_points(self.T_view_world, points_m)

@@ -30,30 +30,33 @@ def splat_points(
     import cv2
 
     s = SUPERSAMPLING
-    W, H = view.size[0] * s, view.size[1] * s
     uv, depth = view.project(points_m)
+    largest = int(np.ceil(disc_radius_px(view, np.full(1, 1e-9), radius_m)[0] * s)) + 1
+    edge = 2 * largest  # so that discs which reach into the picture are whole on the canvas
+    W, H = view.size[0] * s + 2 * edge, view.size[1] * s + 2 * edge
     # The centre of the small pixel 0 is at (0, 0), so that of the large ones is half a step in.
-    centre = uv * s + (s - 1) / 2.0
+    centre = uv * s + (s - 1) / 2.0 + edge
     with np.errstate(invalid="ignore"):
-        near = np.abs(centre - [W / 2.0, H / 2.0]) < [W / 2.0 + 40, H / 2.0 + 40]
-    order = np.flatnonzero((depth > view.near_m) & near.all(1))
+        inside = ((centre >= largest) & (centre < [W - largest - 1, H - largest - 1])).all(1)
+    order = np.flatnonzero((depth > view.near_m) & inside)
     order = order[np.argsort(-depth[order], kind="stable")]
-    centre, depth = np.round(centre[order]).astype(np.int64), depth[order]
-    radius = np.round(disc_radius_px(view, depth, radius_m) * s)
+    column, row = np.floor(centre[order] + 0.5).astype(np.int32).T
+    radius = np.round(disc_radius_px(view, depth[order], radius_m) * s)
     owner = np.full(W * H, -1, np.int32)
-    for r in np.unique(radius):  # a handful of sizes
-        pixels, which = _disc_pixels(centre, np.flatnonzero(radius == r), int(r), (W, H))
-        owner[pixels] = which
+    shade = np.empty(W * H, np.uint8)
+    for r in np.unique(radius).astype(int).tolist():  # a handful of sizes
+        group = np.flatnonzero(radius == r).astype(np.int32)
+        offsets, shades = _disc(r, W)
+        pixels = (row[group] * W + column[group])[:, None] + offsets
+        owner[pixels] = group[:, None]
+        shade[pixels] = shades
     hit = np.flatnonzero(owner >= 0)
-    index = owner[hit]
-    rgb = faded(view, colors[order].astype(np.float32), depth, background)
-    offset = np.stack([hit % W, hit // W], 1) - centre[index]
-    shade = ball_shade((offset**2).sum(1) / radius[index] ** 2)
-    shade[radius[index] < SHADED_FROM_PX * s] = 1.0
+    rgb = faded(view, colors[order].astype(np.float32), depth[order], background)
     canvas = np.empty((W * H, 3), np.uint8)
     canvas[:] = background
-    canvas[hit] = np.round(rgb[index] * shade[:, None])
-    return cv2.resize(canvas.reshape(H, W, 3), view.size, interpolation=cv2.INTER_AREA)
+    canvas[hit] = rgb[owner[hit]] * (shade[hit, None] * np.float32(1 / 255)) + np.float32(0.5)
+    whole = canvas.reshape(H, W, 3)[edge:-edge, edge:-edge]
+    return cv2.resize(whole, view.size, interpolation=cv2.INTER_AREA)
 
 
 def disc_radius_px(view: View, depth_m: Array, radius_m: float) -> Array:
@@ -77,16 +80,12 @@ def faded(view: View, colors: Array, depth_m: Array, background: Color) -> Array
     return (colors * (1.0 - share) + np.array(background) * share).astype(np.float32)
 
 
-def _disc_pixels(
-    centres: NDArray[np.int64], group: NDArray[np.int64], radius: int, size: tuple[int, int]
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Flat pixels of the discs round `centres[group]`, in that order, and whose each pixel is."""
-    W, H = size
+def _disc(radius: int, W: int) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
+    """Of a disc of that radius: offsets of its flat pixels in rows of W, and how bright each is."""
     span = np.arange(-radius, radius + 1)
     du, dv = np.meshgrid(span, span)
+    share = (du**2 + dv**2) / max(radius, 1) ** 2
     inside = du**2 + dv**2 <= (radius + 0.3) ** 2
-    u = centres[group, :1] + du[inside]
-    v = centres[group, 1:] + dv[inside]
-    ok = (u >= 0) & (v >= 0) & (u < W) & (v < H)
-    which = np.broadcast_to(group[:, None].astype(np.int32), u.shape)[ok]
-    return (v * W + u)[ok], which
+    is_shaded = radius >= SHADED_FROM_PX * SUPERSAMPLING
+    bright = ball_shade(share[inside]) if is_shaded else np.ones(inside.sum())
+    return (dv * W + du)[inside].astype(np.int32), np.round(255 * bright).astype(np.uint8)

@@ -16,9 +16,9 @@ from pipelines.io.result import Result
 from pipelines.types import Array, Image
 from viz import style
 from viz.chase import chase_views
-from viz.legend import draw_key
+from viz.legend import draw_key_and_scale
 from viz.moment import build_stage, draw_moment, draw_moment_labels
-from viz.moment_legend import draw_moment_legend, moment_key
+from viz.moment_legend import draw_moment_title, moment_key
 from viz.mp4 import open_mp4
 from viz.playback import Playback, build_playback
 from viz.points import check_names, draw_points
@@ -70,17 +70,16 @@ def write_video(
     )
     ground, stage = next(pictures), build_stage(playback)
     # One legend for all frames: it must not jump about.
-    key = moment_key(stage, [box for boxes in playback.boxes for box in boxes])
+    key = moment_key(stage, views[0], [box for boxes in playback.boxes for box in boxes])
     with open_mp4(path, size, durations_s(playback.timestamps_s)) as video:
         for k, own in enumerate(views):
             if k and not still:
-                ground, stage = next(pictures), build_stage(playback)
+                ground = next(pictures)
             picture = ground.copy()
             draw_moment(picture, own, stage, k, dark=dark)
-            if frame_px:
-                taken = draw_key(picture, own, key, dark=dark)
-            else:
-                taken = draw_moment_legend(picture, own, result, stage, k, key, dark=dark)
+            taken = draw_key_and_scale(picture, own, key, playback.scene, dark=dark)
+            if not frame_px:
+                taken.append(draw_moment_title(picture, own, result, playback, k, dark=dark))
             draw_moment_labels(picture, own, playback, k, taken)
             if frame_px:
                 picture = np.concatenate([frames.at(k, (size[0], frame_px)), picture])

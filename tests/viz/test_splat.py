@@ -59,3 +59,19 @@ def test_points_at_the_edge_are_cut_not_wrapped():
     picture = splat([[0.795, 0.0, 1.0]], [[0, 0, 0]], radius_m=0.2)
     assert (picture[:, 140:] < 255).any()
     assert (picture[:, :100] == 255).all()
+
+
+def test_a_disc_that_reaches_into_the_picture_is_drawn_so_far():
+    large = View("test", (1280, 960), np.diag([8.0, 8.0, 1.0]) @ K, np.eye(4))
+    black = np.zeros((1, 3), np.uint8)
+    x = (-3.0 - large.K[0, 2]) / large.K[0, 0]  # its middle is 3 pixels beyond the left side
+    picture = splat_points(large, np.array([[x, 0.0, 1.0]]), black, 0.05, WHITE)
+    columns = np.nonzero((picture < 128).any(2))[1]
+    assert columns.min() == 0 and columns.max() in (3, 4)
+
+
+def test_far_points_fade_and_near_ones_are_left_out():
+    view = View("test", (160, 120), K, np.eye(4), near_m=0.5, haze=(2.0, 6.0, 0.5))
+    for z, shown in ((0.4, 255), (1.0, 0), (4.0, 64), (9.0, 128)):
+        picture = splat_points(view, np.array([[0.0, 0.0, z]]), np.uint8([[0, 0, 0]]), 0.05, WHITE)
+        assert picture[59:61, 79:81].min() == pytest.approx(shown, abs=2)
