@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 Values = dict[str, float]
 
-PEERS = "run by this project's authors on the same files, two cores, no GPU"
+PEERS = "Run by this project's authors on the same files, two cores, no GPU"
 DYNOSAM = "Morris et al., DynoSAM, T-RO 2025, tables I and IV (second-hand); RMSE"
 DYNASLAM = "Bescos et al., DynaSLAM, RA-L 2018"
 DROIDW = "table in DROID-W, arXiv 2603.19076"

@@ -28,6 +28,12 @@ RUN_KEYS = (
 RUN_HEADINGS = ("camera m", "camera deg", "object m", "object deg", "speed km/h", "signed km/h")
 BY_KEY = {m.key: m for m in (*MEASURES, *FURTHER, FRAME_TIME)}
 
+_SPEED_NOTE = (
+    "RMSEs over frames, but for speed: the mean size of its error. Our speeds are those of the "
+    "centre of what is seen of an object, against the speed of the true one's origin; VDO-SLAM's "
+    "are taken at its own centre in both."
+)
+
 Table = list[list[str]]
 Cell = Callable[[Measure, float | None], str]
 
@@ -119,8 +125,7 @@ def _accuracy(content: dict[str, Any], keys: Sequence[str], sources: list[str]) 
         return []
     table = [["sequence", "system", "frames", *(m.heading for m in shown)]]
     table += [[*words, *_cells(shown, values, write)] for words, values, write in rows]
-    note = "RMSEs over frames, but for speed: the mean size of its error."
-    return [_markdown(table, 2), note] if "speed_kmh" in keys else [_markdown(table, 2)]
+    return [_markdown(table, 2), *([_wrapped(_SPEED_NOTE)] if "speed_kmh" in keys else [])]
 
 
 def _each_run(content: dict[str, Any], sources: list[str]) -> list[str]:
