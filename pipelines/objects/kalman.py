@@ -115,6 +115,13 @@ class ObjectFilter:
         self._kf.P[:, :3] = 0.0
         self._kf.P[:3, :3] = covariance_m2
 
+    def forget_velocity(self) -> None:
+        """Begin anew with a velocity that nobody knows; the centre stays."""
+        self._kf.x[3:] = 0.0
+        self._kf.P[3:] = 0.0
+        self._kf.P[:, 3:] = 0.0
+        self._kf.P[3:, 3:] = self._FIRST_SPEED_MPS**2 * np.eye(3)
+
     def update_motion(
         self,
         center_m: Array,

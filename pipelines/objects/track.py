@@ -230,6 +230,8 @@ class ObjectTrack:
             self.filter = ObjectFilter(origin, loose, self.config.acceleration_mps2)
         elif not self.is_anchored:
             self.filter.move_to(origin, loose)
+            if not self.has_motion:
+                self.filter.forget_velocity()  # it came of wandering middles of masks
         self.filter.update_motion(
             origin, loose, (origin - before) / dt_s, covariance_m2 / dt_s**2,
             turn_radps=rotation_vector(H) / dt_s, dt_s=dt_s,

@@ -143,6 +143,19 @@ def test_the_first_centre_makes_filter_and_pose():
     assert isinstance(track.filter, ObjectFilter) and track.center_sigma_m == 1.0
 
 
+def test_middles_of_masks_leave_no_speed_once_a_motion_is_measured():
+    """A parked car behind something: the middle of its mask wanders off before it comes free."""
+    track = ObjectTrack(1, ObjectsConfig())
+    for k in range(6):
+        track.take_center(CENTER + np.array([0.0, 0.0, 1.5]) * k)
+        track.filter.predict(DT_S)
+    assert np.linalg.norm(track.filter.velocity_mps) > 3.0
+    track.take_motion(turn_and_go(CENTER, 0.0, np.zeros(3)), SURE, CENTER, DT_S)
+    assert np.linalg.norm(track.filter.velocity_mps) < 0.01
+    assert not track.surely_moves
+    np.testing.assert_allclose(track.filter.center_m, CENTER, atol=0.01)
+
+
 def test_the_box_ignores_a_stray_point_and_grows_gradually():
     track, _ = drive(1)
     rng, T = np.random.default_rng(2), track.T_world_object
