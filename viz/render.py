@@ -79,11 +79,12 @@ def render_result(
         else:
             alone = picture.copy()
             draw_points_legend(alone, view, result, dark=dark)
-            written.append(target / f"static_{view.name}.png")
-            write_image(written[-1], alone, compression=COMPRESSION)
             _draw_paths(picture, view, result, playback, dark)
         written.append(target / f"map_{view.name}.png")
         write_image(written[-1], picture, compression=COMPRESSION)
+        if view.name != "chase":
+            written.append(target / f"static_{view.name}.png")
+            write_image(written[-1], alone, compression=COMPRESSION)
     return written
 
 

@@ -88,7 +88,7 @@ def test_render_draws_pictures_of_the_size_asked_for(result: Path) -> None:
     assert reader.get(cv2.CAP_PROP_FPS) == pytest.approx(10.0)
     ok, first = reader.read()
     assert ok and first.shape[1] == 320 and first.std() > 10.0
-    assert done.stdout.splitlines()[-1].endswith("report.html")
+    assert "report.html" in done.stdout
 
 
 def test_eval_renews_the_report_where_there_is_one(result: Path) -> None:
