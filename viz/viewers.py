@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable
 from importlib import import_module
+from typing import Protocol
 
 from pipelines.errors import ConfigError
 from pipelines.runner import Sink
@@ -17,13 +18,19 @@ VIEWERS = {
 }
 
 
+class Viewer(Sink, Protocol):
+    """What every viewer of the table offers: it never lets the run wait, and changes nothing."""
+
+    n_left_out: int  # pictures that came too fast for the view, so far
+
+
 def load_viewer(
     name: str,
     *,
     host: str | None = None,
     port: int | None = None,
     announce: Callable[[str], None] = lambda url: None,
-) -> Sink:
+) -> Viewer:
     """The viewer of that name, to be handed to `run` among its sinks.
 
     host, port: where it serves, by default on this machine alone and at the first free port.

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from pipelines.config import load_config
 from pipelines.datasets import open_sequence
 from pipelines.datasets.sequence import Sequence
 from pipelines.errors import ConfigError, DyObError
-from pipelines.runner import Sink, run
-from viz.viewers import VIEWERS, load_viewer
+from pipelines.runner import KeyframeSink, run
+from viz.browser.live_map import LiveFrames
+from viz.viewers import VIEWERS, Viewer, load_viewer
 
-N_FRAMES = 5
+N_FRAMES = 8
 OF_THE_CLOCK = ("timings.json", "run.log", "metrics.txt")
 
 
@@ -67,7 +70,7 @@ def test_two_are_at_different_places(name, street, tmp_path):
 
 @pytest.mark.parametrize("name", VIEWERS)
 def test_one_that_was_never_started_ends_in_peace(name):
-    viewer: Sink = load_viewer(name)
+    viewer: Viewer = load_viewer(name)
     viewer.finish()
 
 
@@ -87,6 +90,41 @@ def test_handing_over_waits_for_nothing_however_slow_the_view(name, street, tmp_
             viewer.frame(frame, result)
     assert viewer.n_left_out >= 40 - 10  # with a picture every 10 ms it would be less
     viewer.finish()
+
+
+class Follower:
+    """A sink that follows the back-end's corrections as a viewer does."""
+
+    def __init__(self) -> None:
+        self.frames = LiveFrames()
+        self.came: list[Any] = []  # where each keyframe was when it came, and None for others
+
+    def start(self, *arguments: Any) -> None:
+        pass
+
+    def frame(self, frame: Any, result: Any) -> None:
+        self.frames.add(result)
+        self.came.append(result.T_world_camera if result.is_keyframe else None)
+
+    def keyframes(self, *poses: Any) -> None:
+        self.frames.follow(*poses)
+
+    def finish(self) -> None:
+        pass
+
+
+def test_frames_that_were_shown_follow_the_back_end(street, tmp_path):
+    adjusting = ["backend.local_adjustment=true", "backend.process=false"]
+    settings = ["batch.at_end=false", "mapping.keyframe_max_interval=2", *adjusting]
+    follower = Follower()
+    assert isinstance(follower, KeyframeSink)
+    result = run(street, load_config(None, settings), tmp_path, sinks=[follower])
+    now, there = follower.frames.Ts_world_camera, result.Ts_world_camera
+    # Between keyframes the files spread what a view moves in steps, so these alone are the same.
+    ks = [k for k, T in enumerate(follower.came) if T is not None]
+    came = np.array([follower.came[k] for k in ks])
+    np.testing.assert_allclose(now[ks], there[ks], atol=1e-8)
+    assert np.abs(came - there[ks]).max() > 1e-6
 
 
 def test_a_wrong_name_is_told_the_right_one():
