@@ -194,7 +194,7 @@ def _process(
     if arguments.pictures:
         sinks.append(FrameWriter(every=arguments.pictures))
     if viewer is not None:
-        sinks.append(viewer)
+        sinks.insert(0, viewer)  # before the others, as its port may be taken
     with console.warnings(), console.counting("optimising", arguments.quiet) as optimising:
         result = run_sequence(
             sequence,

@@ -233,11 +233,14 @@ def test_a_live_run_is_seen_and_stays_when_it_is_over(browser, objects, tmp_path
     late = Visit(browser, urls[0])
     assert late.ask("dyob.length") == 8
     early.until("!!dyob.player.source.picture(7)")
+    moved = np.eye(4)
+    moved[:3, 3] = (0.5, 0.0, -1.0)
+    viewer.keyframes(np.array([0]), moved[None])  # all frames hang on the first
     viewer.finish()
     for visit in (early, late):
         visit.until("dyob.player.isOver")
         visit.slide_to(0)
-        assert visit.box(3)["position"][2] == pytest.approx(9.0, abs=2e-3)
+        np.testing.assert_allclose(visit.box(3)["position"], [2.5, 0.8, 8.0], atol=2e-3)
         own = urls[0].split("://")[1]
         assert all(url.split("://")[1].startswith(own) for url in visit.requests if "://" in url)
         assert visit.complaints == []

@@ -19,11 +19,14 @@
     seek: (k) => player.step(k - player.k),
     view: (mode) => player.setView(mode),
     // Boxes as they lie in meshcat's tree now: world positions in m, and pixels of the screen.
-    boxes: () => [...player.world.boxes.entries()].filter(([, { group }]) => group.visible).map(
-      ([id, { group }]) => {
+    boxes: () => {
+      player.viewer.render(); // which is what turns the view's camera
+      const shown = [...player.world.boxes.entries()].filter(([, { group }]) => group.visible);
+      return shown.map(([id, { group }]) => {
         const at = player.labels.project(group.position);
         return { id, position: group.position.toArray(), pixel: at && at.slice(0, 2) };
-      }),
+      });
+    },
     labels: () => player.labels.placed.map(({ box, spot }) => ({ words: box.words, ...spot })),
   };
   Promise.resolve(source.start(player)).catch((error) => {
