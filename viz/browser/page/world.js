@@ -142,14 +142,16 @@ class World {
   gridSpan() {
     const { right, forward } = this.axes, margin = 4 * this.facts.scale_m;
     const low = { x: Infinity, z: Infinity }, high = { x: -Infinity, z: -Infinity };
-    for (const { p } of this.frames.list) {
-      for (const [axis, value] of [["x", p.dot(right)], ["z", p.dot(forward)]]) {
-        low[axis] = Math.min(low[axis], value - margin);
-        high[axis] = Math.max(high[axis], value + margin);
+    const widen = (x, z, by) => {
+      for (const [axis, value] of [["x", x], ["z", z]]) {
+        low[axis] = Math.min(low[axis], value - by);
+        high[axis] = Math.max(high[axis], value + by);
       }
-    }
+    };
+    for (const { p } of this.frames.list) widen(p.dot(right), p.dot(forward), margin);
+    for (const [x, z] of this.facts.extent_m) widen(x, z, 0);
     const span = Math.max(high.x - low.x, high.z - low.z);
-    const cell = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200].find((c) => span / c <= 30) || 500;
+    const cell = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200].find((c) => span / c <= 40) || 500;
     for (const axis of ["x", "z"]) {
       low[axis] = cell * Math.floor(low[axis] / cell);
       high[axis] = cell * Math.ceil(high[axis] / cell);
