@@ -37,7 +37,7 @@ from pipelines.datasets.simulated.motion import blur_along, rigid_flow
 from pipelines.datasets.simulated.scenes import Scene, find_scene, scaled_camera
 from pipelines.errors import ConfigError, FrameError
 from pipelines.geometry import invert_T, make_T
-from pipelines.types import Array, Frame, GroundTruth, Image, ObjectTruth
+from pipelines.types import Array, Frame, GroundTruth, Image, KnownNoise, ObjectTruth
 
 VERSION = 4  # of what the same scene and seed look like: raise it when that changes
 INPUTS = ("depth", "flow", "masks", "right")
@@ -118,7 +118,9 @@ class SimulatedSequence(Sequence):
         if "right" in self._provide:
             self._right = self._folder(base, "right", {"right": True}, self._render_right)
         if self._how.any:
-            faults = {"degrade": asdict(self._how), "right": "right" in self._provide}
+            sizes = asdict(self._how)
+            del sizes["flow_sigma_px"]  # added when read
+            faults = {"degrade": sizes, "right": "right" in self._provide}
             if self._noise_seed != self._seed:
                 faults["noise_seed"] = self._noise_seed
             self._worn = self._folder(base, "degraded", faults, self._wear)
@@ -154,6 +156,9 @@ class SimulatedSequence(Sequence):
                 flow = worn["flow"].astype(np.float32) * np.float32(_FLOW_STEP_PX)
             else:
                 flow = self._exact_flow(index - 1)
+            if self._how.flow_sigma_px > 0:
+                noise = self._rng(index, 5).standard_normal(flow.shape, np.float32)
+                flow = flow + np.float32(self._how.flow_sigma_px) * noise
         labels = found["labels"].astype(np.int32) if "masks" in self._provide else None
         return Frame(
             index,
@@ -186,7 +191,16 @@ class SimulatedSequence(Sequence):
             truth["moving"][row],
             self._pixel_counts(truth["object_id"])[frame, row],
         )
-        return GroundTruth(self.timestamps_s.copy(), truth["Ts_world_camera"][:N], objects)
+        return GroundTruth(
+            self.timestamps_s.copy(), truth["Ts_world_camera"][:N], objects, self._known_noise()
+        )
+
+    def _known_noise(self) -> KnownNoise | None:
+        """The noise of the inputs, where it is white and what bears it is provided."""
+        how = self._how
+        if not how.is_white or not {"depth", "flow"} <= self._provide:
+            return None
+        return KnownNoise(how.flow_sigma_px, how.disparity_sigma_px)
 
     def _pixel_counts(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """(N, A) pixels that each object is seen in; counted once, when the truth is asked for."""
