@@ -14,10 +14,17 @@ from numpy.typing import NDArray
 from pipelines.backend.batch_problem import BatchProblem, Stretch
 from pipelines.backend.global_batch import BatchResult
 from pipelines.frame_observations import STATIC, FrameObservations
-from pipelines.geometry import invert_T, orthonormalise, skew, transform_points
+from pipelines.geometry import (
+    invert_T,
+    orthonormalise,
+    rotation_vector,
+    skew,
+    transform_points,
+)
 from pipelines.object_types import ObjectEstimates
 from pipelines.objects.kalman import direction_std
-from pipelines.objects.motion import displacement
+from pipelines.objects.motion import displacement, largest_std
+from pipelines.objects.track import middle_doubt_mps
 from pipelines.types import Array
 
 
@@ -98,7 +105,11 @@ def _take_stretch(
         covariance = _about_center(result.covariances.steps[o], L, center)
         rows.motion_covariances[row] = covariance
         std_mps = direction_std(way_m, covariance[3:, 3:]) / dts_s[n - 1]
-        rows.speed_std_mps[row] = rows.velocity_std_mps[row] = std_mps
+        # Better motions do not tell better where the middle is, whose speed is told
+        turn_std = float(largest_std(covariance[:3, :3]))
+        turn = max(0.0, float(np.linalg.norm(rotation_vector(H))) - turn_std)
+        doubt_mps = middle_doubt_mps(rows.extents_m[row], turn / float(dts_s[n - 1]))
+        rows.speed_std_mps[row] = rows.velocity_std_mps[row] = np.hypot(std_mps, doubt_mps)
 
 
 def _about_center(covariance: Array, T_world_object: Array, center_m: Array) -> Array:

@@ -16,9 +16,10 @@ from pipelines.backend.batch_problem import BatchProblem, build_problem
 from pipelines.backend.batch_solver import solve
 from pipelines.backend.guard import CAMERA, Verdict, judge
 from pipelines.backend.held_out import hold_out
-from pipelines.backend.marginals import PoseCovariances, pose_covariances
+from pipelines.backend.marginals import PoseCovariances
 from pipelines.backend.object_graph import pose_graph
 from pipelines.backend.point_elimination import Residuals
+from pipelines.backend.score_bootstrap import bootstrap_covariances
 from pipelines.config import BatchConfig
 from pipelines.frame_observations import FrameObservations
 from pipelines.object_types import ObjectEstimates
@@ -108,7 +109,7 @@ def run_global_batch(
     step()
     covariances = None
     if config.covariances and verdicts[CAMERA].accepted:
-        covariances = pose_covariances(solution.problem, graph, solution.residuals)
+        covariances = bootstrap_covariances(solution.problem, graph, solution.residuals)
     step()
     n_outliers = int((~keep_uv).sum() + (~keep_disparity).sum())
     costs = np.array([cost_before, solution.cost])
