@@ -89,7 +89,10 @@ def _take_stretch(
             continue
         L, o = poses[n], stretch.first_pose + n
         rows.Ts_world_object[row] = L
-        if result.covariances is not None:
+        if (
+            result.covariances is not None
+            and not result.kept_motions[stretch.first_pose : o + 1].any()
+        ):
             pose_std[row] = _spread(result.covariances.objects[o])
         if n == 0:
             continue  # the stretch begins here: the motion to it is not known
@@ -100,8 +103,8 @@ def _take_stretch(
         rows.Hs_world_curr_prev[row], rows.centers_m[row] = H, center
         rows.velocities_mps[row] = way_m / dts_s[n - 1]
         rows.speed_mps[row] = np.linalg.norm(way_m) / dts_s[n - 1]
-        if result.covariances is None:
-            continue
+        if result.covariances is None or result.kept_motions[o]:
+            continue  # the front-end's own
         covariance = _about_center(result.covariances.steps[o], L, center)
         rows.motion_covariances[row] = covariance
         std_mps = direction_std(way_m, covariance[3:, 3:]) / dts_s[n - 1]
