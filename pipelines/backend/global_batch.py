@@ -115,8 +115,10 @@ def run_global_batch(
     step()
     n_outliers = int((~keep_uv).sum() + (~keep_disparity).sum())
     costs = np.array([cost_before, solution.cost])
-    kept = misfit_motions(problem, solution.problem, objects)
     result = as_result(problem, solution.problem, verdicts, costs, n_outliers)
+    kept = result.kept_motions
+    if config.guard:
+        kept = misfit_motions(problem, solution.problem, objects)
     return with_motions(result, kept, covariances)
 
 

@@ -5,15 +5,16 @@ Owns the faults and their sizes. Truth is never touched; every fault is determin
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import ConfigError
-from pipelines.types import Array, Image, StereoCamera
+from pipelines.types import Array, Image, KnownNoise, StereoCamera
 
 _ALL = ("disparity", "holes", "flow", "masks", "blur", "exposure", "noise")
 _WHITE = "white"  # for measuring against the Cramer-Rao bound: nothing like it exists in nature
@@ -87,15 +88,24 @@ class Degradation:
     def touches_masks(self) -> bool:
         return self.mask_wear_px > 0 or self.mask_drop_share > 0
 
-    @property
-    def is_white(self) -> bool:
-        """Whether disparity and flow have white noise, and nothing but pictures has other."""
+    def known_noise(self, provide: Collection[str]) -> KnownNoise | None:
+        """The noise of the inputs, where it is white and what bears it is provided.
+
+        That of pictures may stand beside it.
+        """
         only = Degradation(
             disparity_sigma_px=self.disparity_sigma_px,
             flow_sigma_px=self.flow_sigma_px,
             noise_sigma=self.noise_sigma,
         )
-        return self == only and min(self.disparity_sigma_px, self.flow_sigma_px) > 0
+        is_white = self == only and min(self.disparity_sigma_px, self.flow_sigma_px) > 0
+        if not is_white or not {"depth", "flow"} <= set(provide):
+            return None
+        return KnownNoise(self.flow_sigma_px, self.disparity_sigma_px)
+
+    def stored(self) -> dict[str, Any]:
+        """The sizes of all faults whose effects are kept on disk; others are applied when read."""
+        return {key: size for key, size in asdict(self).items() if key != "flow_sigma_px"}
 
     @property
     def any(self) -> bool:
@@ -137,6 +147,16 @@ def _holes(
         interpolation=cv2.INTER_LINEAR,
     )
     return blobs | (rim & (patches > 0.5))
+
+
+def noisy_flow(
+    flow_px: NDArray[np.float32], how: Degradation, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Flow (H, W, 2) with noise that is independent in each pixel and axis."""
+    if how.flow_sigma_px == 0:
+        return flow_px
+    noise = rng.standard_normal(flow_px.shape, np.float32)
+    return flow_px + np.float32(how.flow_sigma_px) * noise
 
 
 def worn_masks(

@@ -29,6 +29,7 @@ from pipelines.datasets.simulated.degrade import (
     Degradation,
     computed_flow,
     exposure_gain,
+    noisy_flow,
     worn_depth,
     worn_image,
     worn_masks,
@@ -37,7 +38,7 @@ from pipelines.datasets.simulated.motion import blur_along, rigid_flow
 from pipelines.datasets.simulated.scenes import Scene, find_scene, scaled_camera
 from pipelines.errors import ConfigError, FrameError
 from pipelines.geometry import invert_T, make_T
-from pipelines.types import Array, Frame, GroundTruth, Image, KnownNoise, ObjectTruth
+from pipelines.types import Array, Frame, GroundTruth, Image, ObjectTruth
 
 VERSION = 4  # of what the same scene and seed look like: raise it when that changes
 INPUTS = ("depth", "flow", "masks", "right")
@@ -118,9 +119,7 @@ class SimulatedSequence(Sequence):
         if "right" in self._provide:
             self._right = self._folder(base, "right", {"right": True}, self._render_right)
         if self._how.any:
-            sizes = asdict(self._how)
-            del sizes["flow_sigma_px"]  # added when read
-            faults = {"degrade": sizes, "right": "right" in self._provide}
+            faults = {"degrade": self._how.stored(), "right": "right" in self._provide}
             if self._noise_seed != self._seed:
                 faults["noise_seed"] = self._noise_seed
             self._worn = self._folder(base, "degraded", faults, self._wear)
@@ -156,9 +155,7 @@ class SimulatedSequence(Sequence):
                 flow = worn["flow"].astype(np.float32) * np.float32(_FLOW_STEP_PX)
             else:
                 flow = self._exact_flow(index - 1)
-            if self._how.flow_sigma_px > 0:
-                noise = self._rng(index, 5).standard_normal(flow.shape, np.float32)
-                flow = flow + np.float32(self._how.flow_sigma_px) * noise
+            flow = noisy_flow(flow, self._how, self._rng(index, 5))
         labels = found["labels"].astype(np.int32) if "masks" in self._provide else None
         return Frame(
             index,
@@ -191,16 +188,8 @@ class SimulatedSequence(Sequence):
             truth["moving"][row],
             self._pixel_counts(truth["object_id"])[frame, row],
         )
-        return GroundTruth(
-            self.timestamps_s.copy(), truth["Ts_world_camera"][:N], objects, self._known_noise()
-        )
-
-    def _known_noise(self) -> KnownNoise | None:
-        """The noise of the inputs, where it is white and what bears it is provided."""
-        how = self._how
-        if not how.is_white or not {"depth", "flow"} <= self._provide:
-            return None
-        return KnownNoise(how.flow_sigma_px, how.disparity_sigma_px)
+        noise = self._how.known_noise(self._provide)
+        return GroundTruth(self.timestamps_s.copy(), truth["Ts_world_camera"][:N], objects, noise)
 
     def _pixel_counts(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """(N, A) pixels that each object is seen in; counted once, when the truth is asked for."""
@@ -252,10 +241,8 @@ class SimulatedSequence(Sequence):
         world = self._renderer.world
         presence = {}
         if any(a.present is not None for a in world.actors):
-            frames = range(self._frames)
-            presence["present"] = np.array(
-                [[a.is_present(k) for a in world.actors] for k in frames], bool
-            )
+            there = [[a.is_present(k) for a in world.actors] for k in range(self._frames)]
+            presence["present"] = np.array(there, bool)
         write_arrays(
             folder / "truth.npz",
             **presence,
