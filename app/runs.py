@@ -99,7 +99,7 @@ def evaluate(arguments: Namespace) -> int:
     from pipelines.io.result import load_result
     from viz.report import write_report
 
-    metrics = evaluate_result(arguments.result)
+    metrics = evaluate_result(arguments.result, with_bound=True)
     result = load_result(arguments.result)
     if (result.folder / REPORT).exists():  # else `render` will write it
         write_report(result)

@@ -190,6 +190,7 @@ def _block(result: BatchResult | None, config: BatchConfig, time_s: float) -> di
         "sightings": len(result.before.tracks),
         "object_poses": len(result.before.Ts_world_object),
         "outliers": result.n_outliers,
+        "motions_kept": int(result.kept_motions.sum()),
         "cost_before": result.cost_before,
         "cost_after": result.cost_after,
         "camera": verdicts.pop("0"),
@@ -208,6 +209,11 @@ def _tell(result: BatchResult | None, block: dict[str, Any]) -> None:
         _log.info(
             "batch refused for %s: held-out error %.3f before, %.3f after; the front-end's "
             "answer is kept", what, verdict.before, verdict.after,
+        )  # fmt: skip
+    if result.kept_motions.any():
+        _log.info(
+            "batch refused for %d single motions of objects, which fit what was seen of them worse "
+            "than the front-end's", int(result.kept_motions.sum()),
         )  # fmt: skip
     _log.info(
         "batch: %d frames, %d sightings of %d points, cost %.0f -> %.0f, held-out error of the "

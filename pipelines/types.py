@@ -128,6 +128,13 @@ class ObjectTruth:
     def __len__(self) -> int:
         return len(self.frame_index)
 
+    @classmethod
+    def empty(cls) -> ObjectTruth:
+        """No object at all."""
+        whole = np.empty(0, np.int64)
+        boxes, moving = np.empty((0, 4)), np.empty(0, bool)
+        return cls(whole, whole, np.empty(0, "U16"), np.empty((0, 4, 4)), boxes, moving)
+
     def __getitem__(self, which: NDArray) -> ObjectTruth:
         """The rows chosen by a boolean mask or an index array."""
         names = [f.name for f in fields(self) if getattr(self, f.name) is not None]
@@ -135,16 +142,29 @@ class ObjectTruth:
 
 
 @dataclass(frozen=True, slots=True)
+class KnownNoise:
+    """Standard deviations in px of white Gaussian noise, per pixel and axis, in given inputs.
+
+    flow_px: of dense flow. disparity_px: of disparity, or of depth seen as disparity.
+    """
+
+    flow_px: float
+    disparity_px: float
+
+
+@dataclass(frozen=True, slots=True)
 class GroundTruth:
     """What the evaluator alone may see.
 
     timestamps_s: (N,) of the frames. Ts_world_camera: (N, 4, 4), NaN where unknown, in any world
-    frame (the evaluator aligns). objects: true object states, or None.
+    frame (the evaluator aligns). objects: true object states, or None. noise: of the inputs, where
+    they are exact but for it.
     """
 
     timestamps_s: Array
     Ts_world_camera: Array
     objects: ObjectTruth | None = None
+    noise: KnownNoise | None = None
 
     def __post_init__(self) -> None:
         N = len(self.timestamps_s)

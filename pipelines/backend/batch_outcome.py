@@ -14,10 +14,17 @@ from numpy.typing import NDArray
 from pipelines.backend.batch_problem import BatchProblem, Stretch
 from pipelines.backend.global_batch import BatchResult
 from pipelines.frame_observations import STATIC, FrameObservations
-from pipelines.geometry import invert_T, orthonormalise, skew, transform_points
+from pipelines.geometry import (
+    invert_T,
+    orthonormalise,
+    rotation_vector,
+    skew,
+    transform_points,
+)
 from pipelines.object_types import ObjectEstimates
 from pipelines.objects.kalman import direction_std
-from pipelines.objects.motion import displacement
+from pipelines.objects.motion import displacement, largest_std
+from pipelines.objects.track import middle_doubt_mps
 from pipelines.types import Array
 
 
@@ -82,7 +89,10 @@ def _take_stretch(
             continue
         L, o = poses[n], stretch.first_pose + n
         rows.Ts_world_object[row] = L
-        if result.covariances is not None:
+        if (
+            result.covariances is not None
+            and not result.kept_motions[stretch.first_pose : o + 1].any()
+        ):
             pose_std[row] = _spread(result.covariances.objects[o])
         if n == 0:
             continue  # the stretch begins here: the motion to it is not known
@@ -93,12 +103,16 @@ def _take_stretch(
         rows.Hs_world_curr_prev[row], rows.centers_m[row] = H, center
         rows.velocities_mps[row] = way_m / dts_s[n - 1]
         rows.speed_mps[row] = np.linalg.norm(way_m) / dts_s[n - 1]
-        if result.covariances is None:
-            continue
+        if result.covariances is None or result.kept_motions[o]:
+            continue  # the front-end's own
         covariance = _about_center(result.covariances.steps[o], L, center)
         rows.motion_covariances[row] = covariance
         std_mps = direction_std(way_m, covariance[3:, 3:]) / dts_s[n - 1]
-        rows.speed_std_mps[row] = rows.velocity_std_mps[row] = std_mps
+        # Better motions do not tell better where the middle is, whose speed is told
+        turn_std = float(largest_std(covariance[:3, :3]))
+        turn = max(0.0, float(np.linalg.norm(rotation_vector(H))) - turn_std)
+        doubt_mps = middle_doubt_mps(rows.extents_m[row], turn / float(dts_s[n - 1]))
+        rows.speed_std_mps[row] = rows.velocity_std_mps[row] = np.hypot(std_mps, doubt_mps)
 
 
 def _about_center(covariance: Array, T_world_object: Array, center_m: Array) -> Array:

@@ -7,18 +7,19 @@ does is in the modules beside this one.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.backend.batch_problem import BatchProblem, build_problem
 from pipelines.backend.batch_solver import solve
-from pipelines.backend.guard import CAMERA, Verdict, judge
+from pipelines.backend.guard import CAMERA, Verdict, judge, keep_motions, misfit_motions
 from pipelines.backend.held_out import hold_out
-from pipelines.backend.marginals import PoseCovariances, pose_covariances
+from pipelines.backend.marginals import PoseCovariances
 from pipelines.backend.object_graph import pose_graph
 from pipelines.backend.point_elimination import Residuals
+from pipelines.backend.score_bootstrap import bootstrap_covariances
 from pipelines.config import BatchConfig
 from pipelines.frame_observations import FrameObservations
 from pipelines.object_types import ObjectEstimates
@@ -35,14 +36,16 @@ class BatchResult:
     """What a batch came to.
 
     before, after: the problem at the front-end's answer and at the batch's; what was refused is in
-    `after` as it was in `before`. verdicts: of the cameras first. covariances: at the batch's
-    optimum, None where they were not wanted. cost_before, cost_after: robust costs. n_outliers:
-    pixels and disparities left out.
+    `after` as it was in `before`. verdicts: of the cameras first. kept_motions: (O,) bool, motions
+    to these object poses that stayed the front-end's though their object was believed.
+    covariances: at the batch's optimum, None where they were not wanted. cost_before, cost_after:
+    robust costs. n_outliers: pixels and disparities left out.
     """
 
     before: BatchProblem
     after: BatchProblem
     verdicts: tuple[Verdict, ...]
+    kept_motions: NDArray[np.bool_]
     covariances: PoseCovariances | None
     cost_before: float
     cost_after: float
@@ -108,11 +111,15 @@ def run_global_batch(
     step()
     covariances = None
     if config.covariances and verdicts[CAMERA].accepted:
-        covariances = pose_covariances(solution.problem, graph, solution.residuals)
+        covariances = bootstrap_covariances(solution.problem, graph, solution.residuals)
     step()
     n_outliers = int((~keep_uv).sum() + (~keep_disparity).sum())
     costs = np.array([cost_before, solution.cost])
-    return as_result(problem, solution.problem, verdicts, covariances, costs, n_outliers)
+    result = as_result(problem, solution.problem, verdicts, costs, n_outliers)
+    kept = result.kept_motions
+    if config.guard:
+        kept = misfit_motions(problem, solution.problem, objects)
+    return with_motions(result, kept, covariances)
 
 
 def has_enough(log: Sequence[FrameObservations]) -> bool:
@@ -133,15 +140,29 @@ def as_result(
     before: BatchProblem,
     solved: BatchProblem,
     verdicts: tuple[Verdict, ...],
-    covariances: PoseCovariances | None,
     costs: Array,
     n_outliers: int,
 ) -> BatchResult:
     """What is left of a solution by its verdicts. costs: (2,) before and after."""
     after = _accept(before, solved, verdicts)
+    none = np.zeros(len(before.Ts_world_object), bool)
     return BatchResult(
-        before, after, verdicts, covariances, float(costs[0]), float(costs[1]), n_outliers
+        before, after, verdicts, none, None, float(costs[0]), float(costs[1]), n_outliers
     )
+
+
+def with_motions(
+    result: BatchResult, kept: NDArray[np.bool_], covariances: PoseCovariances | None
+) -> BatchResult:
+    """The result with single motions left as they were, in objects that were not refused anyway.
+
+    kept: (O,) motions to these poses. covariances: of the solution.
+    """
+    kept = kept & result.accepted
+    for stretch in result.before.stretches:
+        kept[stretch.poses] &= stretch.object_id in result.accepted_objects
+    after = keep_motions(result.before, result.after, kept) if kept.any() else result.after
+    return replace(result, after=after, kept_motions=kept, covariances=covariances)
 
 
 def _accept(

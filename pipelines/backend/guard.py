@@ -1,6 +1,7 @@
 """Never worse: what of a batch is believed, by sightings that it was not shown.
 
-Owns the verdict on the cameras and on each object. Writes and logs nothing.
+Owns the verdict on the cameras, on each object and on each single motion of one. Writes and logs
+nothing.
 """
 
 from __future__ import annotations
@@ -8,12 +9,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.backend.batch_problem import BatchProblem
 from pipelines.backend.held_out import HeldOut, held_out_errors
-from pipelines.backend.point_elimination import settle_points
+from pipelines.backend.point_elimination import evaluate, settle_points
+from pipelines.geometry import invert_T, orthonormalise
+from pipelines.object_types import ObjectEstimates
+from pipelines.objects.motion import fuse_motions
 from pipelines.types import Array
 
+# Five times chi-square, 6 degrees of freedom, 99.9 %: real errors are not white. Of a thousand
+# motions of simulated sequences, none that the batch made better comes near both
+_RULED_OUT = 5.0 * 22.5
+_BEHIND = 100.0  # squared standard deviations that a point behind the camera counts as
 _TOLERANCE = 1.002  # of an error, up to which it is as good as before
 _SIGNIFICANT = 1.0  # standard deviations of the growth, below which it may be chance
 CAMERA = 0  # body of the static world
@@ -69,6 +78,80 @@ def judge(
         worse_by = float(growth.mean()) / max(chance, 1e-12)
         verdicts.append(Verdict(int(object_id), n, sizes[0], sizes[1], worse_by, is_binding))
     return tuple(verdicts)
+
+
+def misfit_motions(
+    before: BatchProblem, after: BatchProblem, objects: ObjectEstimates
+) -> NDArray[np.bool_]:
+    """(O,) motions to object poses that all there is of them speaks against.
+
+    objects: the front-end's rows. The held-out sightings judge an object as a whole, as a single
+    motion has too few of them. Here what the two frames saw of the object, outliers of the batch
+    and all, misfits the batch's motion by far more than six numbers fit by chance beside the
+    front-end's (a likelihood-ratio test), and the front-end's own covariance rules it out.
+    """
+    n, growth = len(before.Ts_world_object), np.zeros(len(before.Ts_world_object))
+    view = before.tracks.view - before.n_frames
+    on_object = view >= 0
+    for problem, sign in ((before, -1.0), (after, 1.0)):
+        squares = _squares(problem)[on_object]
+        growth += sign * np.bincount(view[on_object], squares, n)
+    found: NDArray[np.bool_] = np.zeros(n, bool)
+    told = _front_end_motions(before, after)
+    for stretch in before.stretches:
+        rows, steps = stretch.rows[1:], np.arange(stretch.first_pose + 1, stretch.poses.stop)
+        poses = after.Ts_world_object[stretch.poses]
+        centers = np.einsum(
+            "nij,nj->ni", invert_T(told[steps]), np.pad(objects.centers_m[rows], ((0, 0), (0, 1)),
+            constant_values=1.0),
+        )[:, :3]  # fmt: skip
+        surprise = fuse_motions(
+            told[steps],
+            objects.motion_covariances[rows],
+            poses[1:] @ invert_T(poses[:-1]),
+            np.zeros((len(rows), 6, 6)),
+            centers,
+        ).distance2
+        found[steps] = (growth[steps] > _RULED_OUT) & ~(surprise <= _RULED_OUT)
+    return found
+
+
+def _front_end_motions(before: BatchProblem, after: BatchProblem) -> Array:
+    """(O, 4, 4) motions to object poses by the front-end, as seen from the batch's cameras."""
+    C = after.Ts_world_camera @ invert_T(before.Ts_world_camera)
+    Hs = np.full_like(before.Ts_world_object, np.nan)
+    for stretch in before.stretches:
+        L, moved = before.Ts_world_object[stretch.poses], C[stretch.frames]
+        steps = L[1:] @ invert_T(L[:-1])
+        Hs[stretch.first_pose + 1 : stretch.poses.stop] = moved[1:] @ steps @ invert_T(moved[:-1])
+    return Hs
+
+
+def _squares(problem: BatchProblem) -> Array:
+    """(N,) squared whitened residuals under Huber's kernel, with points settled for the poses."""
+    views = problem.views(problem.Ts_world_camera, problem.Ts_world_object)
+    points = settle_points(problem.camera, problem.tracks, views, problem.points_m)
+    every = np.ones(len(problem.tracks), bool)
+    seen = evaluate(problem.camera, problem.tracks, views, points, every, every)
+    w_uv, w_disparity = seen.weight_uv, seen.weight_disparity
+    squares = (seen.uv**2).sum(1) * w_uv * (2.0 - w_uv)
+    squares += seen.disparity**2 * w_disparity * (2.0 - w_disparity)
+    return np.where(w_uv > 0.0, squares, _BEHIND)
+
+
+def keep_motions(
+    before: BatchProblem, after: BatchProblem, kept: NDArray[np.bool_]
+) -> BatchProblem:
+    """The batch's answer, but with the front-end's motions, as seen from its cameras, where kept.
+
+    kept: (O,) motions to these poses. What follows in a stretch goes on from there.
+    """
+    told, poses = _front_end_motions(before, after), after.Ts_world_object.copy()
+    for stretch in before.stretches:
+        for o in range(stretch.first_pose + 1, stretch.poses.stop):
+            new = after.Ts_world_object[o] @ invert_T(after.Ts_world_object[o - 1])
+            poses[o] = (told[o] if kept[o] else new) @ poses[o - 1]
+    return after.at(after.Ts_world_camera, orthonormalise(poses), after.points_m)
 
 
 def _errors(problem: BatchProblem, held: HeldOut) -> Array:

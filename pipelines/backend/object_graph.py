@@ -44,6 +44,19 @@ def pose_graph(
 
     n_held: how many cameras are held where they are.
     """
+    graph = gauge_graph(problem, n_held)
+    for stretch in problem.stretches:
+        o = stretch.first_pose
+        times = problem.timestamps_s[stretch.frames]
+        for n in range(2, len(stretch)):
+            graph.add(_smoothness(o + n, np.diff(times[n - 2 : n + 1]), config))
+        if config.planar_sigma > 0.0 and stretch.class_name in ROAD_VEHICLES:
+            _add_planar(graph, problem, stretch, config.planar_sigma)
+    return graph
+
+
+def gauge_graph(problem: BatchProblem, n_held: int = 1) -> gtsam.NonlinearFactorGraph:
+    """The priors alone, without which the poses could all move together."""
     import gtsam
 
     graph = gtsam.NonlinearFactorGraph()
@@ -51,14 +64,8 @@ def pose_graph(
     for k, T in enumerate(problem.Ts_world_camera[:n_held]):
         graph.add(gtsam.PriorFactorPose3(camera_key(k), gtsam.Pose3(T), gauge))
     for stretch in problem.stretches:
-        o = stretch.first_pose
-        begin = gtsam.Pose3(problem.Ts_world_object[o])
-        graph.add(gtsam.PriorFactorPose3(object_key(o), begin, gauge))
-        times = problem.timestamps_s[stretch.frames]
-        for n in range(2, len(stretch)):
-            graph.add(_smoothness(o + n, np.diff(times[n - 2 : n + 1]), config))
-        if config.planar_sigma > 0.0 and stretch.class_name in ROAD_VEHICLES:
-            _add_planar(graph, problem, stretch, config.planar_sigma)
+        begin = gtsam.Pose3(problem.Ts_world_object[stretch.first_pose])
+        graph.add(gtsam.PriorFactorPose3(object_key(stretch.first_pose), begin, gauge))
     return graph
 
 

@@ -54,7 +54,7 @@ def run_partial_batch(
         n_outliers += left_out
         progress(number + 1, len(windows))
     verdicts = judge(before, problem, held, config.guard)
-    return as_result(before, problem, verdicts, None, costs, n_outliers)
+    return as_result(before, problem, verdicts, costs, n_outliers)
 
 
 def _windows(n_frames: int, size: int, overlap: int) -> list[tuple[int, int]]:

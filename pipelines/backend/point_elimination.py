@@ -52,13 +52,15 @@ class ViewSystem:
     """What all points say of small changes of the V views, right perturbations [omega rad, v m].
 
     The system H x = g. first, second: (M,) views with first <= second. blocks: (M, 6, 6) of H.
-    gradient: (V, 6). `step_points` gives the points' own best answer to a change of the views.
+    gradient: (V, 6). pull: (N, 6) what each sighting adds to it. `step_points` gives the points'
+    own best answer to a change of the views.
     """
 
     first: Index
     second: Index
     blocks: Array
     gradient: Array
+    pull: Array
     _H_inverse: Array
     _g: Array
     _C: Array
@@ -181,6 +183,7 @@ def eliminate_points(
     V = tracks.n_views
     gradient = np.zeros((V, 6))
     H_inverse, g = np.empty((tracks.n_tracks, 3, 3)), np.empty((tracks.n_tracks, 3))
+    pull = np.empty((len(tracks), 6))
     C = np.empty((len(tracks), 3, 6), np.float32)  # the largest array: twice as long runs fit
     parts: list[Blocks] = [sum_blocks(np.empty(0, int), np.empty(0, int), np.empty((0, 6, 6)), V)]
     for own, rows, part in tracks.parts(_SIGHTINGS_A_PART):
@@ -193,11 +196,11 @@ def eliminate_points(
         )
         seen = _whiten(camera, part, Ts_body_camera, points_m[own], few)
         H_inverse[own], g[own] = _point_system(seen, part, damping)
-        blocks, pull, C[rows] = _eliminate_part(part, seen, H_inverse[own], g[own])
-        gradient += np.stack([np.bincount(part.view, column, V) for column in pull.T], -1)
+        blocks, pull[rows], C[rows] = _eliminate_part(part, seen, H_inverse[own], g[own])
+        gradient += np.stack([np.bincount(part.view, column, V) for column in pull[rows].T], -1)
         first, second, values = (np.concatenate(x) for x in zip(*parts, *blocks, strict=True))
         parts = [sum_blocks(first, second, values, V)]
-    return ViewSystem(*parts[0], gradient, H_inverse, g, C, tracks)
+    return ViewSystem(*parts[0], gradient, pull, H_inverse, g, C, tracks)
 
 
 def _eliminate_part(

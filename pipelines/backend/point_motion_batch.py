@@ -70,7 +70,7 @@ def run_point_motion_batch(
     solved = _read(problem, optimizer.values())
     ends = np.array([costs[0], costs[-1]])
     verdicts = judge(problem, solved, held, config.guard)
-    return as_result(problem, solved, verdicts, None, ends, 0)
+    return as_result(problem, solved, verdicts, ends, 0)
 
 
 def _point_key(row: int) -> int:

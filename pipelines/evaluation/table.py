@@ -16,7 +16,15 @@ OBJECTS = "Object errors"
 FOUND = "Objects found"
 TIMES = "Time a frame"
 BATCH = "Global batch"
-HEADINGS = (ERRORS, OBJECTS, FOUND, BATCH, TIMES)  # a block's first line begins with one of them
+BOUND = "Over the Cramer-Rao bound"
+HEADINGS = (
+    ERRORS,
+    OBJECTS,
+    FOUND,
+    BATCH,
+    BOUND,
+    TIMES,
+)  # a block's first line begins with one of them
 STATISTICS = ("rmse", "mean", "median", "max")
 ERROR_ROWS = (  # label, unit, digits, keys of the statistics with {} for their name
     ("ATE, SE(3) aligned", "m", 4, "ate_{}_m"),
@@ -35,6 +43,14 @@ OBJECT_ROWS = (  # label, unit, digits, block, keys of the statistics with {} fo
     ("Speed, smoothed", "km/h", 3, "smoothed_speed", "error_{}_kmh"),
     ("Pose, translation", "m", 4, "pose", "trans_{}_m"),
     ("Pose, rotation", "deg", 3, "pose", "rot_{}_deg"),
+)
+BOUND_ROWS = (  # block, label
+    ("motion_only_ba", "Camera step"),
+    ("object_motion", "Object motion"),
+    ("batch_camera_step", "Batch: camera step"),
+    ("batch_camera", "Batch: camera pose"),
+    ("batch_object_motion", "Batch: object motion"),
+    ("batch_object_pose", "Batch: object pose"),
 )
 TIMING_LABELS = {TOTAL: "all work, in two threads", WALL: "on the clock, with reading"}
 HYPOTHESES = {"pnp_ransac": "PnP RANSAC", "rgbd_odometry": "RGB-D odometry"}
@@ -67,6 +83,9 @@ def metrics_text(metrics: dict[str, Any], timings: dict[str, Any] | None = None)
     batch = batch_rows(metrics)
     if batch:
         blocks.append(_block([(BATCH, "before", "after", ""), *batch]))
+    bounds = bound_rows(metrics)
+    if bounds:
+        blocks.append(_block([(BOUND, "RMSE", "bound", "ratio", ""), *bounds]))
     if times:
         blocks.append(_block([(TIMES, "median", "95 %", ""), *times]))
     return "\n\n".join(blocks) + "\n"
@@ -152,6 +171,20 @@ def batch_rows(metrics: dict[str, Any]) -> list[Row]:
         rows.append(("Refused: the front-end's answers are kept", "", "", ""))
     elif kept:
         rows.append((f"Refused for objects {', '.join(map(str, kept))}", "", "", ""))
+    return rows
+
+
+def bound_rows(metrics: dict[str, Any]) -> list[Row]:
+    """Rows (label, RMSE, bound, ratio, unit) of the errors beside the least that they could be."""
+    rows: list[Row] = []
+    for key, label in BOUND_ROWS:
+        block = metrics.get("bound", {}).get(key, {})
+        for name, unit, digits, words in (("trans", "m", 5, ""), ("rot", "deg", 4, ", rotation")):
+            values = [block.get(f"{name}_{column}_{unit}") for column in ("rmse", "bound")]
+            ratio = block.get(f"{name}_ratio")
+            if ratio is not None:
+                cells = (*(f"{value:.{digits}f}" for value in values), f"{ratio:.2f}")
+                rows.append((label + words, *cells, unit))
     return rows
 
 

@@ -20,6 +20,7 @@ CAMERA_KITTI = "camera_kitti.txt"
 CAMERA_GT_TUM = "camera_gt_tum.txt"
 OBJECTS_CSV = "objects.csv"
 OBJECTS_GT_CSV = "objects_gt.csv"
+NOISE_GT = "noise_gt.json"
 OBJECTS = "objects"  # a folder: a trajectory an object
 STATIC_MAP = "static_map.ply"
 METRICS_JSON = "metrics.json"
@@ -70,7 +71,7 @@ def clear_result_folder(folder: Path | str) -> None:
     folder = Path(folder)
     check_output(folder, LOG)
     files = [CONFIG, LOG, CAMERA_TUM, CAMERA_KITTI, CAMERA_GT_TUM, STATIC_MAP]
-    files += [OBJECTS_CSV, OBJECTS_GT_CSV, CAMERA_STD, SCENE, REPORT]
+    files += [OBJECTS_CSV, OBJECTS_GT_CSV, NOISE_GT, CAMERA_STD, SCENE, REPORT]
     stale = [folder / name for name in (*files, METRICS_JSON, METRICS_TXT, TIMINGS)]
     stale += (folder / OBJECTS).glob("*_tum.txt")
     stale += [*(folder / OBSERVATIONS).glob("*.npz"), *(folder / OBSERVATIONS).glob("*.json")]

@@ -9,7 +9,7 @@ import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -94,15 +94,18 @@ class ResultWriter:
         write_object_trajectories(self.folder / names.OBJECTS, objects)
 
     def write_ground_truth(self, results: Sequence[FrameResult], truth: GroundTruth) -> None:
-        """camera_gt_tum.txt and objects_gt.csv: the truth of the run, moved into our world.
+        """camera_gt_tum.txt, objects_gt.csv, noise_gt.json: the run's truth, moved into our world.
 
         The camera's is written from the first to the last processed frame, the objects' of the
-        processed frames alone, where the truth has any.
+        processed frames alone, where the truth has any. The noise of the inputs is hardly ever
+        known.
         """
         stamps, Ts, T_ours_theirs = _truth_of_run(results, truth)
         if len(Ts) == 0:
             return
         write_tum(self.folder / names.CAMERA_GT_TUM, stamps, Ts)
+        if truth.noise is not None:
+            write_json(self.folder / names.NOISE_GT, asdict(truth.noise))
         if truth.objects is not None:
             run = np.array([r.frame_index for r in results], np.int64)
             objects = truth.objects[np.isin(truth.objects.frame_index, run)]

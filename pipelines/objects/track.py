@@ -40,6 +40,16 @@ _CENTER_SIGMA_M = 0.3  # the filter's centre is held this loosely: its model is 
 _FASTEST_RADPS, _FASTEST_MPS = 2.0, 20.0  # standard deviations of motions not yet known
 
 
+def middle_doubt_mps(extent_m: Array, turn_radps: float) -> float:
+    """Standard deviation of an object's speed by not knowing where its middle is, while it turns.
+
+    Only sides of it are seen, so that the middle of what is seen lies off its own; where it turns,
+    each place of it has another speed. This error is the same in frame after frame. extent_m: (3,).
+    """
+    size_m = float(np.nan_to_num(extent_m).max())
+    return turn_radps * min(_MIDDLE_SHARE * size_m, _LARGEST_OFF_M)
+
+
 @dataclass(slots=True)
 class ObjectTrack:
     """An object that is in sight, or was not long ago.
@@ -136,13 +146,8 @@ class ObjectTrack:
         return float(np.hypot(self.filter.speed_std_mps, self.middle_doubt_mps(turn_radps)))
 
     def middle_doubt_mps(self, turn_radps: float) -> float:
-        """Standard deviation of its speed by not knowing where its middle is, while it turns.
-
-        Only sides of it are seen, so that the middle of what is seen lies off its own; where it
-        turns, each place of it has another speed. This error is the same in frame after frame.
-        """
-        size_m = float(np.nan_to_num(self.extent_m).max())
-        return turn_radps * min(_MIDDLE_SHARE * size_m, _LARGEST_OFF_M)
+        """See `middle_doubt_mps`."""
+        return middle_doubt_mps(self.extent_m, turn_radps)
 
     def is_landmark(self, timestamp_s: float) -> bool:
         """Whether it has been still for so long that it serves the camera as the world does."""

@@ -5,17 +5,19 @@ Owns the faults and their sizes. Truth is never touched; every fault is determin
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import ConfigError
-from pipelines.types import Array, Image, StereoCamera
+from pipelines.types import Array, Image, KnownNoise, StereoCamera
 
 _ALL = ("disparity", "holes", "flow", "masks", "blur", "exposure", "noise")
+_WHITE = "white"  # for measuring against the Cramer-Rao bound: nothing like it exists in nature
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +28,7 @@ class Degradation:
     depth_sigma_per_m: float = 0.0  # RGB-D instead: sigma_z = this * z^2, in 1/m
     hole_share: float = 0.0  # of the picture lost in blobs, besides a rim along depth edges
     computed_flow: bool = False  # DIS optical flow of the (degraded) pictures
+    flow_sigma_px: float = 0.0  # or true flow with Gaussian noise, independent in each pixel
     mask_wear_px: int = 0  # masks eroded or dilated by up to this much
     mask_drop_share: float = 0.0  # of instances in frames missed wholly
     blur_share: float = 0.0  # exposure time as a share of the frame interval
@@ -37,18 +40,29 @@ class Degradation:
         """Faults by name, "all" or e.g. "disparity,flow,masks", at their usual sizes.
 
         indoors: depth noise of an RGB-D camera (1.9 mm z^2) in place of disparity noise (0.3 px).
+        "white", which stands alone: Gaussian noise of disparity and flow, independent in each pixel
+        and so exactly known; pictures so noisy that aligning patches of them adds hardly anything.
         Raises ConfigError, naming the valid ones, where a name is unknown.
         """
         if isinstance(words, Degradation):
             return words
         listed = words.split(",") if isinstance(words, str) else list(words or ())
         names = {word.strip().lower() for word in listed} - {"", "none"}
+        if names == {_WHITE}:
+            return cls(disparity_sigma_px=0.5, flow_sigma_px=0.1, noise_sigma=40.0)
+        if _WHITE in names:
+            raise ConfigError(
+                f"expected the degradation '{_WHITE}' alone, found it with "
+                f"{', '.join(sorted(names - {_WHITE}))}: its noise is known only where all else is "
+                "exact, so leave one of them out"
+            )
         if "all" in names:
             names = (names - {"all"}) | set(_ALL)
         unknown = sorted(names - set(_ALL))
         if unknown:
             raise ConfigError(
-                f"unknown degradation '{unknown[0]}': use all, or some of {', '.join(_ALL)}"
+                f"unknown degradation '{unknown[0]}': use all, or some of {', '.join(_ALL)}, or "
+                f"{_WHITE} alone"
             )
         return cls(
             disparity_sigma_px=0.3 if "disparity" in names and not indoors else 0.0,
@@ -73,6 +87,25 @@ class Degradation:
     @property
     def touches_masks(self) -> bool:
         return self.mask_wear_px > 0 or self.mask_drop_share > 0
+
+    def known_noise(self, provide: Collection[str]) -> KnownNoise | None:
+        """The noise of the inputs, where it is white and what bears it is provided.
+
+        That of pictures may stand beside it.
+        """
+        only = Degradation(
+            disparity_sigma_px=self.disparity_sigma_px,
+            flow_sigma_px=self.flow_sigma_px,
+            noise_sigma=self.noise_sigma,
+        )
+        is_white = self == only and min(self.disparity_sigma_px, self.flow_sigma_px) > 0
+        if not is_white or not {"depth", "flow"} <= set(provide):
+            return None
+        return KnownNoise(self.flow_sigma_px, self.disparity_sigma_px)
+
+    def stored(self) -> dict[str, Any]:
+        """The sizes of all faults whose effects are kept on disk; others are applied when read."""
+        return {key: size for key, size in asdict(self).items() if key != "flow_sigma_px"}
 
     @property
     def any(self) -> bool:
@@ -114,6 +147,16 @@ def _holes(
         interpolation=cv2.INTER_LINEAR,
     )
     return blobs | (rim & (patches > 0.5))
+
+
+def noisy_flow(
+    flow_px: NDArray[np.float32], how: Degradation, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Flow (H, W, 2) with noise that is independent in each pixel and axis."""
+    if how.flow_sigma_px == 0:
+        return flow_px
+    noise = rng.standard_normal(flow_px.shape, np.float32)
+    return flow_px + np.float32(how.flow_sigma_px) * noise
 
 
 def worn_masks(

@@ -29,6 +29,7 @@ from pipelines.datasets.simulated.degrade import (
     Degradation,
     computed_flow,
     exposure_gain,
+    noisy_flow,
     worn_depth,
     worn_image,
     worn_masks,
@@ -118,7 +119,7 @@ class SimulatedSequence(Sequence):
         if "right" in self._provide:
             self._right = self._folder(base, "right", {"right": True}, self._render_right)
         if self._how.any:
-            faults = {"degrade": asdict(self._how), "right": "right" in self._provide}
+            faults = {"degrade": self._how.stored(), "right": "right" in self._provide}
             if self._noise_seed != self._seed:
                 faults["noise_seed"] = self._noise_seed
             self._worn = self._folder(base, "degraded", faults, self._wear)
@@ -154,6 +155,7 @@ class SimulatedSequence(Sequence):
                 flow = worn["flow"].astype(np.float32) * np.float32(_FLOW_STEP_PX)
             else:
                 flow = self._exact_flow(index - 1)
+            flow = noisy_flow(flow, self._how, self._rng(index, 5))
         labels = found["labels"].astype(np.int32) if "masks" in self._provide else None
         return Frame(
             index,
@@ -186,7 +188,8 @@ class SimulatedSequence(Sequence):
             truth["moving"][row],
             self._pixel_counts(truth["object_id"])[frame, row],
         )
-        return GroundTruth(self.timestamps_s.copy(), truth["Ts_world_camera"][:N], objects)
+        noise = self._how.known_noise(self._provide)
+        return GroundTruth(self.timestamps_s.copy(), truth["Ts_world_camera"][:N], objects, noise)
 
     def _pixel_counts(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """(N, A) pixels that each object is seen in; counted once, when the truth is asked for."""
@@ -238,10 +241,8 @@ class SimulatedSequence(Sequence):
         world = self._renderer.world
         presence = {}
         if any(a.present is not None for a in world.actors):
-            frames = range(self._frames)
-            presence["present"] = np.array(
-                [[a.is_present(k) for a in world.actors] for k in frames], bool
-            )
+            there = [[a.is_present(k) for a in world.actors] for k in range(self._frames)]
+            presence["present"] = np.array(there, bool)
         write_arrays(
             folder / "truth.npz",
             **presence,

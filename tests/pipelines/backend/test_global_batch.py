@@ -8,6 +8,7 @@ import pytest
 from pipelines.backend import global_batch
 from pipelines.backend.batch_outcome import corrections, objects_after, trajectory_after
 from pipelines.backend.global_batch import run_global_batch
+from pipelines.backend.guard import Verdict
 from pipelines.backend.partial_batch import run_partial_batch
 from pipelines.backend.point_motion_batch import run_point_motion_batch
 from pipelines.config import BatchConfig
@@ -94,6 +95,48 @@ def test_what_gets_worse_is_refused(make_drive, stereo, monkeypatch, what):
     step = invert_T(result.before.Ts_world_camera[3]) @ drive.objects.Ts_world_object[3]
     now = invert_T(result.after.Ts_world_camera[3]) @ rows.Ts_world_object[3]
     np.testing.assert_allclose(now, step, atol=1e-9)  # as the front-end saw it
+
+
+def motion_errors(H, drive):
+    """(K - 1,) translations in m by which motions err in the true object's frame."""
+    E = invert_T(drive.Ls_true[1:]) @ H @ drive.Ls_true[:-1]
+    return np.linalg.norm(E[:, :3, 3], axis=1)
+
+
+def test_a_single_motion_that_gets_worse_stays_the_front_ends(make_drive, stereo, monkeypatch):
+    """One pose a metre off hardly shows in the held-out sightings of the whole object."""
+    drive = make_drive(3)
+    right = global_batch.solve
+
+    def spoilt(*arguments):
+        solution = right(*arguments)
+        L = solution.problem.Ts_world_object.copy()
+        L[6, 0, 3] += 1.0
+        problem = solution.problem
+        return replace(solution, problem=problem.at(problem.Ts_world_camera, L, problem.points_m))
+
+    good = run_global_batch(stereo, drive.log, drive.objects, CONFIG)
+    assert good.accepted_objects == {1} and not good.kept_motions.any()
+    monkeypatch.setattr(global_batch, "solve", spoilt)
+    verdicts = [Verdict(i, 100, 1.0, 1.0, 0.0) for i in (0, 1)]  # in hundreds of frames it may pass
+    monkeypatch.setattr(global_batch, "judge", lambda *arguments: tuple(verdicts))
+    result = run_global_batch(stereo, drive.log, drive.objects, CONFIG)
+    assert set(np.flatnonzero(result.kept_motions)) == {6, 7}  # to it and away from it
+    moved = corrections(drive.log, result)
+    rows, pose_std = objects_after(drive.objects, drive.log, moved, result)
+    spoilt_m, before_m, best_m = (
+        motion_errors(objects.Hs_world_curr_prev[1:], drive)
+        for objects in (
+            rows,
+            drive.objects,
+            objects_after(drive.objects, drive.log, corrections(drive.log, good), good)[0],
+        )
+    )
+    np.testing.assert_allclose(spoilt_m[5:7], before_m[5:7], rtol=0.4)  # cameras moved
+    np.testing.assert_allclose(np.delete(spoilt_m, [5, 6]), np.delete(best_m, [5, 6]), rtol=1e-6)
+    kept = drive.objects.motion_covariances[6:8]
+    np.testing.assert_array_equal(rows.motion_covariances[6:8], kept)
+    assert np.isfinite(pose_std[:6]).all() and np.isnan(pose_std[6:]).all()
 
 
 def test_the_partial_batch_improves_and_joins_its_windows(make_drive, stereo):

@@ -61,6 +61,31 @@ def test_other_faults_befall_the_same_scene(street, cache):
     assert street.root.exists()
 
 
+def test_white_noise_is_of_the_size_that_the_truth_tells(street, cache):
+    worn = worn_street(cache, "white")
+    noise = worn.ground_truth().noise
+    assert street.ground_truth().noise is None and worn.read(0).flow_prev_to_curr_px is None
+    exact, found = street.read(2), worn.read(2)
+    flow = (found.flow_prev_to_curr_px - exact.flow_prev_to_curr_px).reshape(-1, 2)
+    flow = flow[np.isfinite(flow).all(1)]
+    bf = street.camera.bf
+    disparity = (bf / found.depth_m - bf / exact.depth_m)[exact.depth_m < 25]
+    for error, sigma in ((flow, noise.flow_px), (disparity, noise.disparity_px)):
+        assert 0.97 * sigma < np.nanstd(error) < 1.03 * sigma
+        assert abs(np.nanmean(error)) < 0.03 * sigma
+    assert abs(np.corrcoef(flow.T)[0, 1]) < 0.02
+    assert (found.instance_labels == exact.instance_labels).all()
+    again = worn_street(cache, "white").read(2).flow_prev_to_curr_px
+    np.testing.assert_array_equal(found.flow_prev_to_curr_px, again)
+    alone = worn_street(cache, "white", provide="right").ground_truth()
+    assert alone.noise is None  # its own flow and depth err otherwise
+
+
+def test_white_noise_stands_alone(cache):
+    with pytest.raises(ConfigError, match="alone, found it with flow"):
+        worn_street(cache, "white,flow")
+
+
 def test_disparity_noise_is_a_third_of_a_pixel(street, cache):
     exact, worn = street.read(2).depth_m, worn_street(cache, "disparity").read(2).depth_m
     near = exact < 25
