@@ -179,7 +179,7 @@ def test_an_answer_is_applied_at_its_frame_however_soon_it_is_there(mapped) -> N
         back_end.after_keyframe(sparse_map, Features.empty())
         back_end.after_keyframe(sparse_map, Features.empty())  # one at a time
         assert len(worker.questions) == 1
-        n = len(worker.questions[0][1][1][0].keyframe)
+        n = len(worker.questions[0][1][1][0].tracks)
         if quick:
             worker.answer()
         for _ in range(1 + n // 1500):
@@ -227,10 +227,10 @@ def test_the_window_is_copied_and_holds_the_first_keyframe(mapped) -> None:
         problem = window.problem
         assert not problem.held[-1] and problem.held.any()
         assert problem.held[window.keyframes == 0].all()
-        assert (np.bincount(problem.point) >= 2).all()
+        assert (problem.tracks.lengths >= 2).all()
         assert not np.shares_memory(problem.points_m, sparse_map.position_m)
         K = len(window.keyframes)
-        np.testing.assert_array_equal(np.unique(problem.keyframe), np.arange(K))
+        np.testing.assert_array_equal(np.unique(problem.tracks.view), np.arange(K))
         correction = to_correction(window, adjust_bundle(problem))
         assert sparse_map.alive[correction.point_ids].all()
     assert (
