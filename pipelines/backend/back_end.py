@@ -3,7 +3,8 @@
 Owns the one question that is under way and the judgement of its answer. What is adjusted is chosen
 by `local_window` and solved by `bundle_adjustment`; loops are found by `loop_detection`, closed by
 `pose_graph` and then settled by `loop_adjustment`; `mapping.correction` moves the map. A loop goes
-before a local adjustment, but not before the full one of the loop that was found last.
+before a local adjustment, but not before the full one of the loop that was found last. Places seen
+again where they should be ask for a full one, too, whenever the map has grown by a fifth.
 
 An answer is applied a fixed number of frames after its question, however soon it is there: so the
 same run moves the same map at the same frame, in a process or in this one.
@@ -47,6 +48,7 @@ _MIN_AGREEING = 0.5  # share of observations; where fewer agree, something else 
 _MAX_MOVE_M, _MAX_MOVE_SHARE = 0.05, 0.02  # of a keyframe, and of its way from the held ones
 _MAX_TURN_DEG = 0.5  # of a keyframe
 _OBSERVATIONS_PER_EDGE = 3  # what an edge of the pose graph costs, in observations
+_GROWN = 1.2  # times the keyframes of the last full adjustment: worth another, if loops tell more
 _log = logging.getLogger("dyob.backend")
 
 
@@ -82,7 +84,9 @@ class BackEnd:
         self.sensor, self.config = sensor, config
         self.worker = worker or (ProcessWorker() if config.process else InlineWorker())
         self._question: _Question | None = None
-        self._closed: LoopClosure | None = None  # by the pose graph, and not yet adjusted
+        self._closed: LoopClosure | None = None  # the latest that the map has closed, not settled
+        self._must_settle = False  # at once, as the pose graph had to close it
+        self._n_settled = 0  # keyframes in the last full adjustment
         self._loops = LoopDetector(sensor, places)
         self._n_frames = 0
         self._warned = self._is_started = False
@@ -95,8 +99,6 @@ class BackEnd:
         worse, and those that never came, are dropped.
         """
         self._n_frames += 1
-        if self._n_frames == 1 and self.config.local_adjustment:
-            self._start_worker()
         question = self._question
         if question is None:
             return None
@@ -113,7 +115,7 @@ class BackEnd:
     def settle(self, sparse_map: SparseMap) -> MapCorrection | None:
         """The correction that is under way, now; to be called until nothing is, after the end."""
         if self._question is None and self._closed is not None:
-            self._adjust_loop(sparse_map, self._closed)
+            self._settle_loop(sparse_map, self._closed)
         return None if self._question is None else self._judge(self._question)
 
     def _judge(self, question: _Question) -> MapCorrection | None:
@@ -131,34 +133,41 @@ class BackEnd:
         self.n_applied += 1
         self.n_full += question.is_full
         if self.config.full_adjustment and question.closes is not None:
-            self._closed = question.closes
+            self._closed, self._must_settle = question.closes, True
         return verdict
 
     def after_keyframe(self, sparse_map: SparseMap, features: Features) -> None:
         """Ask what the map's latest keyframe, with these ORB features, is good for.
 
-        Is it a place seen before, the pose graph is asked, and once that is applied the adjustment
-        of all; else that of the keyframe and its neighbours, unless an answer is awaited. The map
-        is copied, not changed.
+        Is it a place seen before, but not where it should be, the pose graph is asked, and once
+        that is applied the adjustment of all; else that of the keyframe and its neighbours, unless
+        an answer is awaited. The map is copied, not changed.
         """
-        if self.config.loop_closing and self._close_loop(sparse_map, features):
+        n, config = len(sparse_map.keyframes), self.config
+        adjusts = config.local_adjustment and n >= config.local_from_keyframe
+        if adjusts or (config.loop_closing and n >= FEWEST_KEYFRAMES):
+            self._start_worker()
+        if config.loop_closing and self._close_loop(sparse_map, features):
             return
         if self._question is not None:
             return
-        if self._closed is not None:
-            self._adjust_loop(sparse_map, self._closed)
-        elif self.config.local_adjustment:
+        has_grown = n >= _GROWN * self._n_settled
+        if self._closed is not None and (self._must_settle or has_grown):
+            self._settle_loop(sparse_map, self._closed)
+        elif adjusts:
             self._adjust(sparse_map)
 
     def _close_loop(self, sparse_map: SparseMap, features: Features) -> bool:
         """Ask for the pose graph where the latest keyframe closes a loop that is open."""
-        if len(sparse_map.keyframes) >= FEWEST_KEYFRAMES:
-            self._start_worker()
         loop = self._loops.take(sparse_map, features)
-        if loop is None or not loop.is_open:
+        if loop is None or (self._question is not None and self._question.is_full):
             return False
-        if self._closed is not None or (self._question is not None and self._question.is_full):
-            return False  # what closes the loop before this one may close this one, too
+        if self._must_settle:
+            return False  # what settles the loop before this one may close this one, too
+        if not loop.is_open:
+            if self.config.full_adjustment:
+                self._closed = loop
+            return False
         frames = [sparse_map.keyframes[k].frame_index for k in (loop.keyframe, loop.place)]
         _log.info("loop: frame %d sees the place of frame %d", *frames)
         graph = build_pose_graph(sparse_map, [loop])
@@ -189,9 +198,10 @@ class BackEnd:
         due = self._due(len(window.problem.tracks))
         self._question = _Question("local bundle adjustment", answer, due, judge)
 
-    def _adjust_loop(self, sparse_map: SparseMap, loop: LoopClosure) -> None:
-        """Ask for the full adjustment of a map in which the pose graph has closed a loop."""
-        self._closed = None
+    def _settle_loop(self, sparse_map: SparseMap, loop: LoopClosure) -> None:
+        """Ask for the full adjustment of a map in which a loop is closed."""
+        self._closed, self._must_settle = None, False
+        self._n_settled = len(sparse_map.keyframes)
         question = loop_question(sparse_map, self.sensor, loop)
         most = self.config.points_per_keyframe * len(sparse_map.keyframes)
         n = len(question.seen)
@@ -221,6 +231,7 @@ class BackEnd:
     def close(self) -> None:
         """End the process, if there is one; an answer that is under way never comes."""
         self._question = self._closed = None
+        self._must_settle = False
         self.worker.close()
 
     def _warn(self, what: str, error: Exception) -> None:

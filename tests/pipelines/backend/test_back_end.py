@@ -24,9 +24,9 @@ from pipelines.runner import run
 from pipelines.types import Features, TrackingStatus
 
 # Many keyframes, so that much is adjusted in few frames
-SETTINGS = ("backend.local_adjustment=true", "mapping.keyframe_max_interval=2")
+SETTINGS = ("backend.local_from_keyframe=0", "mapping.keyframe_max_interval=2")
 
-ADJUSTING = BackendConfig(local_adjustment=True, loop_closing=False)
+ADJUSTING = BackendConfig(local_from_keyframe=0, loop_closing=False)
 PLACES = SeenPlaces(PlacesConfig())  # of which nobody asks
 
 
@@ -195,7 +195,7 @@ def test_an_answer_is_applied_at_its_frame_however_soon_it_is_there(mapped) -> N
 def test_without_waiting_an_answer_is_taken_when_it_comes(mapped) -> None:
     sparse_map, sensor = mapped
     worker = Slow()
-    config = BackendConfig(local_adjustment=True, loop_closing=False, wait=False)
+    config = BackendConfig(local_from_keyframe=0, loop_closing=False, wait=False)
     back_end = BackEnd(sensor, config, PLACES, worker)
     back_end.after_keyframe(sparse_map, Features.empty())
     for _ in range(30):

@@ -221,7 +221,7 @@ def looping_back_end(drive, monkeypatch, **settings):
 
 def test_the_full_adjustment_follows_the_pose_graph_and_later_loops_wait(monkeypatch) -> None:
     drive = make_drive(2)
-    back_end, worker = looping_back_end(drive, monkeypatch, local_adjustment=True)
+    back_end, worker = looping_back_end(drive, monkeypatch, local_from_keyframe=0)
     back_end.after_keyframe(drive.sparse_map, Features.empty())
     assert worker.answer() == "solve_pose_graph"
     due = [back_end.take() for _ in range(10)]
