@@ -28,7 +28,7 @@ from pipelines.frontend.orb import OrbExtractor
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame, Tracker
 from pipelines.frontend.view import PreparedFrame, View, complete_view, prepare_frame
-from pipelines.mapping.correction import FrameAnchors, correct_map
+from pipelines.mapping.correction import FrameAnchors, MapCorrection, correct_map
 from pipelines.mapping.local_mapping import LocalMapping
 from pipelines.mapping.sightings import static_sightings
 from pipelines.mapping.sparse_map import SparseMap
@@ -202,6 +202,11 @@ class DyObSlam:
             return list(results)
         return self._anchors.revise(self.map, results)
 
+    def settle(self) -> None:
+        """Wait for what the back-end has under way, and let the map follow it: after the end."""
+        while self._backend.is_busy:
+            self._follow(self._backend.settle(self.map))
+
     def close(self) -> None:
         """End the back-end's process; frames may still come, and start it again."""
         self._backend.close()
@@ -210,11 +215,15 @@ class DyObSlam:
 
     def _take_correction(self) -> None:
         """Let the map, and all that is remembered in the world, follow an answer that is due."""
-        correction = self._backend.take()
+        self._follow(self._backend.take())
+
+    def _follow(self, correction: MapCorrection | None) -> None:
         if correction is None:
             return
         C = correct_map(self.map, correction)
         self._tracker.move_world(C)
+        pairs = correction.duplicates
+        self._tracker.rename_points(pairs[self.map.alive[pairs[:, 0]]])
         self._objects.move_world(C)
         self._geometry.move_world(C)
 

@@ -121,6 +121,7 @@ def run(
             sink.start(sequence, len(indices), config, folder)
         try:
             _process_all(sequence, slam, indices, sinks, progress)
+            slam.settle()
         except KeyboardInterrupt:
             _note_interruption(progress)
         except Exception:

@@ -1,8 +1,10 @@
 """Bundle adjustment and loops beside tracking: when they are asked, when an answer moves the map.
 
 Owns the one question that is under way and the judgement of its answer. What is adjusted is chosen
-by `local_window` and solved by `bundle_adjustment`; loops are found by `loop_detection` and closed
-by `pose_graph`; `mapping.correction` moves the map. A loop goes before an adjustment.
+by `local_window` and solved by `bundle_adjustment`; loops are found by `loop_detection`, closed by
+`pose_graph` and then settled by `loop_adjustment`; `mapping.correction` moves the map. A loop goes
+before a local adjustment, but not before the full one of the loop that was found last. Places seen
+again where they should be ask for a full one, too, whenever the map has grown by a fifth.
 
 An answer is applied a fixed number of frames after its question, however soon it is there: so the
 same run moves the same map at the same frame, in a process or in this one.
@@ -18,9 +20,20 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.backend.bundle_adjustment import BundleSolution, adjust_bundle, load_solver
+from pipelines.backend.bundle_adjustment import (
+    BundleProblem,
+    BundleSolution,
+    adjust_bundle,
+    load_solver,
+)
 from pipelines.backend.local_window import BundleWindow, local_window, to_correction
-from pipelines.backend.loop_detection import FEWEST_KEYFRAMES, LoopDetector
+from pipelines.backend.loop_adjustment import (
+    LoopAnswer,
+    adjust_loop,
+    loop_adjustment_correction,
+    loop_question,
+)
+from pipelines.backend.loop_detection import FEWEST_KEYFRAMES, LoopClosure, LoopDetector
 from pipelines.backend.pose_graph import build_pose_graph, loop_correction, solve_pose_graph
 from pipelines.backend.seen_places import SeenPlaces
 from pipelines.backend.worker import InlineWorker, ProcessWorker, Worker
@@ -35,6 +48,7 @@ _MIN_AGREEING = 0.5  # share of observations; where fewer agree, something else 
 _MAX_MOVE_M, _MAX_MOVE_SHARE = 0.05, 0.02  # of a keyframe, and of its way from the held ones
 _MAX_TURN_DEG = 0.5  # of a keyframe
 _OBSERVATIONS_PER_EDGE = 3  # what an edge of the pose graph costs, in observations
+_GROWN = 1.2  # times the keyframes of the last full adjustment: worth another, if loops tell more
 _log = logging.getLogger("dyob.backend")
 
 
@@ -42,13 +56,16 @@ _log = logging.getLogger("dyob.backend")
 class _Question:
     """Work under way. what: for people. due: the count of frames at which its answer is applied.
 
-    judge: makes a correction of the answer, or says why it is refused.
+    judge: makes a correction of the answer, or says why it is refused. closes: the loop that it
+    does, if it is the pose graph's. is_full: whether it is the full adjustment.
     """
 
     what: str
     answer: Future[Any]
     due: int
     judge: Callable[[Any], MapCorrection | str]
+    closes: LoopClosure | None = None
+    is_full: bool = False
 
 
 class BackEnd:
@@ -67,10 +84,13 @@ class BackEnd:
         self.sensor, self.config = sensor, config
         self.worker = worker or (ProcessWorker() if config.process else InlineWorker())
         self._question: _Question | None = None
+        self._closed: LoopClosure | None = None  # the latest that the map has closed, not settled
+        self._must_settle = False  # at once, as the pose graph had to close it
+        self._n_settled = 0  # keyframes in the last full adjustment
         self._loops = LoopDetector(sensor, places)
         self._n_frames = 0
         self._warned = self._is_started = False
-        self.n_applied = self.n_refused = self.n_loops = 0
+        self.n_applied = self.n_refused = self.n_loops = self.n_full = 0
 
     def take(self) -> MapCorrection | None:
         """The correction that is due, if one is; to be called once a frame, before tracking.
@@ -79,14 +99,27 @@ class BackEnd:
         worse, and those that never came, are dropped.
         """
         self._n_frames += 1
-        if self._n_frames == 1 and self.config.local_adjustment:
-            self._start_worker()
         question = self._question
         if question is None:
             return None
         late = self._n_frames >= question.due
         if not (late if self.config.wait else question.answer.done()):
             return None
+        return self._judge(question)
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether an answer is awaited, or a question must still be asked."""
+        return self._question is not None or self._closed is not None
+
+    def settle(self, sparse_map: SparseMap) -> MapCorrection | None:
+        """The correction that is under way, now; to be called until nothing is, after the end."""
+        if self._question is None and self._closed is not None:
+            self._settle_loop(sparse_map, self._closed)
+        return None if self._question is None else self._judge(self._question)
+
+    def _judge(self, question: _Question) -> MapCorrection | None:
+        """The correction that the question has led to, once its answer is there."""
         self._question = None
         try:
             verdict = question.judge(question.answer.result())
@@ -98,25 +131,42 @@ class BackEnd:
             _log.info("%s refused: %s", question.what, verdict)
             return None
         self.n_applied += 1
+        self.n_full += question.is_full
+        if self.config.full_adjustment and question.closes is not None:
+            self._closed, self._must_settle = question.closes, True
         return verdict
 
     def after_keyframe(self, sparse_map: SparseMap, features: Features) -> None:
         """Ask what the map's latest keyframe, with these ORB features, is good for.
 
-        Is it a place seen before, the pose graph is asked; else the adjustment of the keyframe and
-        its neighbours, unless an answer is awaited. The map is copied, not changed.
+        Is it a place seen before, but not where it should be, the pose graph is asked, and once
+        that is applied the adjustment of all; else that of the keyframe and its neighbours, unless
+        an answer is awaited. The map is copied, not changed.
         """
-        if self.config.loop_closing and self._close_loop(sparse_map, features):
+        n, config = len(sparse_map.keyframes), self.config
+        adjusts = config.local_adjustment and n >= config.local_from_keyframe
+        if adjusts or (config.loop_closing and n >= FEWEST_KEYFRAMES):
+            self._start_worker()
+        if config.loop_closing and self._close_loop(sparse_map, features):
             return
-        if self.config.local_adjustment and self._question is None:
+        if self._question is not None:
+            return
+        has_grown = n >= _GROWN * self._n_settled
+        if self._closed is not None and (self._must_settle or has_grown):
+            self._settle_loop(sparse_map, self._closed)
+        elif adjusts:
             self._adjust(sparse_map)
 
     def _close_loop(self, sparse_map: SparseMap, features: Features) -> bool:
         """Ask for the pose graph where the latest keyframe closes a loop that is open."""
-        if len(sparse_map.keyframes) >= FEWEST_KEYFRAMES:
-            self._start_worker()
         loop = self._loops.take(sparse_map, features)
-        if loop is None or not loop.is_open:
+        if loop is None or (self._question is not None and self._question.is_full):
+            return False
+        if self._must_settle:
+            return False  # what settles the loop before this one may close this one, too
+        if not loop.is_open:
+            if self.config.full_adjustment:
+                self._closed = loop
             return False
         frames = [sparse_map.keyframes[k].frame_index for k in (loop.keyframe, loop.place)]
         _log.info("loop: frame %d sees the place of frame %d", *frames)
@@ -125,7 +175,7 @@ class BackEnd:
         answer = self.worker.submit(solve_pose_graph, graph)
         self.n_loops += 1
         self._question = _Question(
-            "loop closing", answer, due, lambda Ts: loop_correction(graph, Ts, loop)
+            "loop closing", answer, due, lambda Ts: loop_correction(graph, Ts, loop), loop
         )
         return True
 
@@ -145,8 +195,32 @@ class BackEnd:
             return reason_to_refuse(window, solution) or to_correction(window, solution)
 
         answer = self.worker.submit(adjust_bundle, window.problem, config.rounds, config.iterations)
-        due = self._due(len(window.problem.keyframe))
+        due = self._due(len(window.problem.tracks))
         self._question = _Question("local bundle adjustment", answer, due, judge)
+
+    def _settle_loop(self, sparse_map: SparseMap, loop: LoopClosure) -> None:
+        """Ask for the full adjustment of a map in which a loop is closed."""
+        self._closed, self._must_settle = None, False
+        self._n_settled = len(sparse_map.keyframes)
+        question = loop_question(sparse_map, self.sensor, loop)
+        most = self.config.points_per_keyframe * len(sparse_map.keyframes)
+        n = len(question.seen)
+        due = self._due(min(n, most) if most else n)
+        answer = self.worker.submit(adjust_loop, question, self.config)
+
+        def judge(answer: LoopAnswer) -> MapCorrection | str:
+            reason = reason_to_refuse_all(answer.problem, answer.solution)
+            if reason is not None:
+                return reason
+            _log.info(
+                "loop settled: %d keyframes and %d points, %d of them mapped twice",
+                len(answer.problem.held),
+                len(answer.point_ids),
+                len(answer.duplicates),
+            )
+            return loop_adjustment_correction(answer)
+
+        self._question = _Question("full bundle adjustment", answer, due, judge, is_full=True)
 
     def _due(self, n_observations: int) -> int:
         """The count of frames at which the answer to a question of some size is applied."""
@@ -156,7 +230,8 @@ class BackEnd:
 
     def close(self) -> None:
         """End the process, if there is one; an answer that is under way never comes."""
-        self._question = None
+        self._question = self._closed = None
+        self._must_settle = False
         self.worker.close()
 
     def _warn(self, what: str, error: Exception) -> None:
@@ -166,14 +241,11 @@ class BackEnd:
         _log.log(level, "%s dropped, the run goes on: %s", what, error)
 
 
-def reason_to_refuse(window: BundleWindow, solution: BundleSolution) -> str | None:
-    """Why a solution is not believed, None where it is.
+def reason_to_refuse_all(problem: BundleProblem, solution: BundleSolution) -> str | None:
+    """Why a solution is not believed, however far it moves what: None where it is.
 
-    It must lower the error of the observations that agree in the end, most must agree, and no
-    keyframe may jump: beyond 5 cm and 2 % of its way from the nearest held one, or by half a
-    degree, which is far more than tracking errs by among neighbours.
+    It must lower the error of the observations that agree in the end, and most must agree.
     """
-    problem = window.problem
     if not np.isfinite(solution.Ts_world_camera).all():
         return "its poses are not finite"
     if not solution.error_after < solution.error_before:
@@ -181,6 +253,19 @@ def reason_to_refuse(window: BundleWindow, solution: BundleSolution) -> str | No
     share = float(solution.inliers.mean())
     if share < _MIN_AGREEING:
         return f"only {share:.0%} of the observations agree with it"
+    return None
+
+
+def reason_to_refuse(window: BundleWindow, solution: BundleSolution) -> str | None:
+    """Why a solution of neighbours is not believed, None where it is.
+
+    Besides all else no keyframe may jump: beyond 5 cm and 2 % of its way from the nearest held one,
+    or by half a degree, which is far more than tracking errs by among neighbours.
+    """
+    problem = window.problem
+    reason = reason_to_refuse_all(problem, solution)
+    if reason is not None:
+        return reason
     Ts_old, Ts_new = problem.Ts_world_camera, solution.Ts_world_camera
     moved_m = np.linalg.norm(Ts_new[:, :3, 3] - Ts_old[:, :3, 3], axis=1)
     centers_m = Ts_old[:, :3, 3]

@@ -144,13 +144,14 @@ def build_problem(
         rows,
     )
     if max_static_per_frame:
-        keep = _choose_static(problem, max_static_per_frame)
+        keep = tracks.view[tracks.starts] >= F
+        keep |= choose_longest(tracks, camera, max_static_per_frame, F)
         problem = replace(
             problem, tracks=tracks.of_tracks(keep), sighting_rows=rows[keep[tracks.track]]
         )
     return replace(
         problem,
-        tracks=_weigh(problem),
+        tracks=weigh(problem.tracks),
         points_m=_last_positions(problem, sightings.position_m),
     )
 
@@ -210,9 +211,8 @@ def _last_positions(problem: BatchProblem, position_m: Array) -> Array:
     return np.einsum("pij,pj->pi", views[:, :3, :3], in_camera) + views[:, :3, 3]
 
 
-def _weigh(problem: BatchProblem) -> PointTracks:
+def weigh(tracks: PointTracks) -> PointTracks:
     """The tracks with pixel sigmas raised by how far they outnumber their witnesses."""
-    tracks = problem.tracks
     cell = np.floor(tracks.uv_px / _CORRELATION_PX).astype(np.int64)
     cell -= cell.min(0, initial=0)
     key = (tracks.view * (cell[:, 1].max(initial=0) + 1) + cell[:, 1]) * (
@@ -225,19 +225,21 @@ def _weigh(problem: BatchProblem) -> PointTracks:
     return tracks.with_sigmas(tracks.sigma_uv_px * factor, tracks.sigma_disparity_px)
 
 
-def _choose_static(problem: BatchProblem, most: int) -> NDArray[np.bool_]:
-    """(P,) which tracks to keep: all of objects; of the static world the longest in each cell.
+def choose_longest(
+    tracks: PointTracks, camera: StereoCamera, most: int, n_views: int | None = None
+) -> NDArray[np.bool_]:
+    """(P,) which tracks are the longest in some cell of some view.
 
-    Cells divide the image so that each frame keeps about `most` sightings.
+    Cells divide the image so that each view keeps about `most` sightings. n_views: only the first
+    so many views are asked, by default all.
     """
-    tracks, camera = problem.tracks, problem.camera
-    starts, lengths = tracks.starts, tracks.lengths
-    keep = tracks.view[starts] >= problem.n_frames
+    lengths = tracks.lengths
+    keep = np.zeros(tracks.n_tracks, bool)
     side = np.sqrt(camera.width * camera.height / most)
     uv = np.clip(tracks.uv_px, 0.0, (camera.width - 1, camera.height - 1))
     columns = int(camera.width // side) + 1
     cell = (uv[:, 1] // side).astype(np.int64) * columns + (uv[:, 0] // side).astype(np.int64)
-    rows = tracks.view < problem.n_frames
+    rows = tracks.view < (tracks.n_views if n_views is None else n_views)
     key = tracks.view * (columns * (int(camera.height // side) + 1)) + cell
     order = np.lexsort((-lengths[tracks.track], key))
     order = order[rows[order]]

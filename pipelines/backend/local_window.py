@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.backend.bundle_adjustment import BundleProblem, BundleSolution
+from pipelines.backend.keyframe_sightings import copy_sightings, to_tracks
 from pipelines.config import BackendConfig
 from pipelines.frontend.sensor import Sensor
 from pipelines.mapping.correction import MapCorrection
 from pipelines.mapping.sparse_map import SparseMap
 
 Ids = NDArray[np.int64]
-_MIN_VIEWS = 2  # keyframes that must see a point for it to take part
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,32 +67,14 @@ def _window(
     sparse_map: SparseMap, sensor: Sensor, held: Ids, free: Ids, wanted: NDArray[np.bool_]
 ) -> BundleWindow:
     keyframes = np.sort(np.concatenate([held, free]))
-    offset_px = sensor.offset.offset_px
-    views = [sparse_map.keyframes[k] for k in keyframes]
-    keep = [wanted[view.tracks.point_ids] for view in views]
-    ids = np.concatenate([v.tracks.point_ids[g] for v, g in zip(views, keep, strict=True)])
-    row = np.repeat(np.arange(len(views)), [int(g.sum()) for g in keep])
-    uv = np.concatenate([v.tracks.uv_px[g] for v, g in zip(views, keep, strict=True)])
-    sigma = np.concatenate([v.tracks.sigma_uv_px[g] for v, g in zip(views, keep, strict=True)])
-    disparity = np.concatenate(
-        [
-            v.tracks.disparity_px[g] + (offset_px - v.disparity_offset_px)
-            for v, g in zip(views, keep, strict=True)
-        ]
-    )
-    often = np.bincount(ids, minlength=len(wanted))[ids] >= _MIN_VIEWS
-    point_ids, point = np.unique(ids[often], return_inverse=True)
+    seen = copy_sightings(sparse_map, sensor, keyframes, wanted)
+    tracks, point_ids = to_tracks(seen)
     problem = BundleProblem(
         sparse_map.camera,
-        np.stack([view.T_world_camera for view in views]),
+        seen.Ts_world_camera,
         np.isin(keyframes, held),
         sparse_map.position_m[point_ids],
-        row[often],
-        point.astype(np.int64),
-        uv[often],
-        disparity[often],
-        sigma[often],
-        np.full(int(often.sum()), sensor.noise.sigma_disparity_px),
+        tracks,
     )
     return BundleWindow(keyframes, point_ids, problem)
 
@@ -100,7 +82,7 @@ def _window(
 def to_correction(window: BundleWindow, solution: BundleSolution) -> MapCorrection:
     """The solution as a correction of the map; points that no observation bears out go along."""
     problem = window.problem
-    borne_out = np.unique(problem.point[solution.inliers])
+    borne_out = np.unique(problem.tracks.track[solution.inliers])
     return MapCorrection(
         window.keyframes,
         problem.Ts_world_camera,

@@ -32,6 +32,7 @@ from pipelines.frontend.rgbd_odometry import estimate_rgbd_odometry
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
 from pipelines.geometry import invert_T, project_stereo, transform_points
+from pipelines.mapping.fusion import rename_points
 from pipelines.mapping.sparse_map import SparseMap
 from pipelines.observations import Tracks
 from pipelines.types import Array, MotionHypothesis, TrackingStatus
@@ -119,6 +120,11 @@ class Tracker:
         """Let what is remembered follow a correction of the map: p_new = C (4, 4) @ p_old."""
         if self.motion is not None:
             self.motion.T_world_camera = C @ self.motion.T_world_camera
+
+    def rename_points(self, pairs: NDArray[np.int64]) -> None:
+        """Follow the first point of each pair (P, 2) where the second one was followed."""
+        if self._last is not None:
+            self._last = replace(self._last, tracks=rename_points(self._last.tracks, pairs))
 
     # -------------------------------------------------------------- tracking
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry import invert_T, make_T, rotation_of, rotation_vector
+from pipelines.mapping.fusion import fuse_points
 from pipelines.mapping.sparse_map import SparseMap
 from pipelines.observations import Tracks
 from pipelines.types import Array, FrameResult
@@ -27,6 +28,7 @@ class MapCorrection:
     shifts_m: (N, 3) how the named points move, to be added to wherever they are by now. All other
     points move with the keyframe that first saw them, keyframes that are newer than the newest one
     named with that one. sights: a keyframe's row and the points that it sees besides its own.
+    duplicates: (P, 2) points that are one, of which the first is kept.
     """
 
     keyframes: Ids
@@ -35,6 +37,7 @@ class MapCorrection:
     point_ids: Ids
     shifts_m: Array
     sights: tuple[int, Tracks] | None = None
+    duplicates: Ids = field(default_factory=lambda: np.empty((0, 2), np.int64))
 
 
 def correct_map(sparse_map: SparseMap, correction: MapCorrection) -> Array:
@@ -55,6 +58,7 @@ def correct_map(sparse_map: SparseMap, correction: MapCorrection) -> Array:
     sparse_map.move_points(Cs, named, shifts)
     if correction.sights is not None:
         sparse_map.add_sights(*correction.sights)
+    fuse_points(sparse_map, correction.duplicates)
     return Cs[-1]
 
 

@@ -246,9 +246,12 @@ class SparseMap:
         self.keyframes[index] = replace(
             keyframe, tracks=Tracks.concatenate(keyframe.tracks, tracks)
         )
-        known = self._covisible[index]
-        others = self.local_keyframes(tracks.point_ids, keyframe.T_world_camera)
-        self._tie(index, np.setdiff1d(others, np.append(known, index)))
+        self.tie_to_others(index, tracks.point_ids)
+
+    def tie_to_others(self, index: int, ids: Ids) -> None:
+        """Note who has become covisible with a keyframe, as it now sees these points as well."""
+        others = self.local_keyframes(ids, self.keyframes[index].T_world_camera)
+        self._tie(index, np.setdiff1d(others, np.append(self._covisible[index], index)))
 
     def _tie(self, index: int, others: Ids) -> None:
         """Note which of some keyframes see so many points of a keyframe that they are covisible."""

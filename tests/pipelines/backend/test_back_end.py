@@ -24,9 +24,9 @@ from pipelines.runner import run
 from pipelines.types import Features, TrackingStatus
 
 # Many keyframes, so that much is adjusted in few frames
-SETTINGS = ("backend.local_adjustment=true", "mapping.keyframe_max_interval=2")
+SETTINGS = ("backend.local_from_keyframe=0", "mapping.keyframe_max_interval=2")
 
-ADJUSTING = BackendConfig(local_adjustment=True, loop_closing=False)
+ADJUSTING = BackendConfig(local_from_keyframe=0, loop_closing=False)
 PLACES = SeenPlaces(PlacesConfig())  # of which nobody asks
 
 
@@ -179,7 +179,7 @@ def test_an_answer_is_applied_at_its_frame_however_soon_it_is_there(mapped) -> N
         back_end.after_keyframe(sparse_map, Features.empty())
         back_end.after_keyframe(sparse_map, Features.empty())  # one at a time
         assert len(worker.questions) == 1
-        n = len(worker.questions[0][1][1][0].keyframe)
+        n = len(worker.questions[0][1][1][0].tracks)
         if quick:
             worker.answer()
         for _ in range(1 + n // 1500):
@@ -195,7 +195,7 @@ def test_an_answer_is_applied_at_its_frame_however_soon_it_is_there(mapped) -> N
 def test_without_waiting_an_answer_is_taken_when_it_comes(mapped) -> None:
     sparse_map, sensor = mapped
     worker = Slow()
-    config = BackendConfig(local_adjustment=True, loop_closing=False, wait=False)
+    config = BackendConfig(local_from_keyframe=0, loop_closing=False, wait=False)
     back_end = BackEnd(sensor, config, PLACES, worker)
     back_end.after_keyframe(sparse_map, Features.empty())
     for _ in range(30):
@@ -227,10 +227,10 @@ def test_the_window_is_copied_and_holds_the_first_keyframe(mapped) -> None:
         problem = window.problem
         assert not problem.held[-1] and problem.held.any()
         assert problem.held[window.keyframes == 0].all()
-        assert (np.bincount(problem.point) >= 2).all()
+        assert (problem.tracks.lengths >= 2).all()
         assert not np.shares_memory(problem.points_m, sparse_map.position_m)
         K = len(window.keyframes)
-        np.testing.assert_array_equal(np.unique(problem.keyframe), np.arange(K))
+        np.testing.assert_array_equal(np.unique(problem.tracks.view), np.arange(K))
         correction = to_correction(window, adjust_bundle(problem))
         assert sparse_map.alive[correction.point_ids].all()
     assert (
