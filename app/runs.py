@@ -61,6 +61,7 @@ def demo(arguments: Namespace) -> int:
     """`demo`: a small simulated sequence, its result, its pictures, and what to do next."""
     from pipelines.config import load_config
     from pipelines.datasets import open_sequence
+    from pipelines.io.folder import SCENE
     from viz.plots import plot_result
     from viz.render import render_result
     from viz.report import write_report
@@ -74,7 +75,7 @@ def demo(arguments: Namespace) -> int:
         return INTERRUPTED
     with console.warnings(), console.working("drawing the map and the trajectory", quiet):
         pictures = render_result(result.folder) + plot_result(result.folder)
-        pictures.append(write_report(result))
+        pictures += [write_report(result), result.folder / SCENE]
     console.pictures(pictures)
     if not quiet:
         if arguments.pictures:
@@ -129,7 +130,7 @@ def optimize(arguments: Namespace) -> int:
 
 def render(arguments: Namespace) -> int:
     """`render RESULT`: pictures in the result folder, the scene as a page, a video on demand."""
-    from pipelines.io.folder import open_result_folder
+    from pipelines.io.folder import SCENE, open_result_folder
     from pipelines.io.result import load_result
     from viz.plots import plot_result
     from viz.render import render_result
@@ -144,7 +145,7 @@ def render(arguments: Namespace) -> int:
         pictures += plot_result(folder)
     if arguments.video:
         pictures.append(_video(folder, arguments))
-    pictures.append(write_report(load_result(folder)))
+    pictures += [write_report(load_result(folder)), folder / SCENE]
     console.pictures(pictures)
     return 0
 

@@ -160,4 +160,4 @@ def test_render_makes_a_video_where_one_is_asked_for(calls, capsys, tmp_path, mo
     ((result, path), options) = seen[0]
     assert result.folder == tmp_path.resolve() and path == result.folder / "renders" / "video.mp4"
     assert (options["view"], options["width"], options["background"]) == ("top", 640, "white")
-    assert capsys.readouterr().out.splitlines()[-2].endswith("video.mp4")
+    assert capsys.readouterr().out.splitlines()[-3].endswith("video.mp4")
