@@ -18,7 +18,7 @@ from pipelines.errors import DyObError
 from pipelines.io import folder as names
 from pipelines.io.files import disk_error, read_json
 from viz import style
-from viz.figures import WIDTH_IN, new_figure, save_figure, two_digits
+from viz.figures import WIDTH_IN, new_figure, save_figure
 from viz.style import hex_color
 
 PEER = "VDO-SLAM"  # the system that the paper compares with
@@ -167,13 +167,16 @@ def _plot_speed_bars(axes: Any, sequence: dict[str, Any]) -> None:
     # Paler, not of another hue: told apart by every eye and on grey paper.
     pale = {"facecolor": hex_color(PALE), "edgecolor": color, "lw": 0.8}
     axes.bar(at + 0.2, signed, 0.38, label="signed mean, |V_est| - |V|, eq. (8)", **pale)
+    # As many decimals as give the highest bar two digits: longer numbers would run into bars.
+    highest = max(np.abs([*sizes, *signed]).max(), 1e-9)
+    decimals = max(1 - int(np.floor(np.log10(highest))), 0)
     for x, values in ((at - 0.2, sizes), (at + 0.2, signed)):
         for place, value in zip(x, values, strict=True):
             below = bool(value < 0)
-            words = "-" * below + two_digits(abs(value))
             axes.annotate(
-                words, (place, value), (0, -3 if below else 3), textcoords="offset points",
-                ha="center", va="top" if below else "bottom", fontsize=9,
+                f"{value:.{decimals}f}", (place, value), (0, -3 if below else 3),
+                textcoords="offset points", ha="center", va="top" if below else "bottom",
+                fontsize=9,
             )  # fmt: skip
     peer = _peer(sequence)
     if peer is not None and "speed_kmh" in peer["values"]:

@@ -26,7 +26,7 @@ class Measure:
 MEASURES = (
     Measure("ate_m", ("camera", "ate_rmse_m"), "ATE m", 4),
     Measure("rpe_trans_m", ("camera", "rpe_trans_rmse_m"), "RPE m", 5),
-    Measure("rpe_rot_deg", ("camera", "rpe_rot_rmse_deg"), "RPE deg", 4),
+    Measure("rpe_rot_deg", ("camera", "rpe_rot_rmse_deg"), "RPE deg", 5),
     Measure("t_rel_percent", ("camera", "kitti_t_rel_percent"), "t_rel %", 3),
     Measure("r_rel_deg", ("camera", "kitti_r_rel_deg_per_100m"), "r_rel deg/100 m", 3),
     Measure("motion_trans_m", ("objects", "motion", "trans_rmse_m"), "motion m", 5),
@@ -67,8 +67,12 @@ def means_of(errors: Iterable[dict[str, float | None]]) -> dict[str, float | Non
 
 
 def cell(measure: Measure, value: float | None) -> str:
-    """A figure of ours in a table, a dash where it is unknown."""
-    return "-" if value is None else f"{measure.factor * value:.{measure.digits}f}"
+    """A figure of ours in a table, a dash where it is unknown; a mean of counts has a tenth."""
+    if value is None:
+        return "-"
+    if measure.digits == 0:
+        return f"{round(value, 1):g}"
+    return f"{measure.factor * value:.{measure.digits}f}"
 
 
 def published_cell(measure: Measure, value: float | None) -> str:

@@ -68,7 +68,7 @@ def test_the_bars_are_as_high_as_the_errors(content) -> None:
     demo, drive = bench_figure_of(content, "speed_errors").axes[:2]
     assert [bar.get_height() for bar in demo.patches] == pytest.approx([0.1, 0.2, -0.05, -0.1])
     assert [line.get_ydata()[0] for line in drive.lines] == [0.32, 0.0]
-    assert [text.get_text() for text in demo.texts] == ["0.10", "0.20", "-0.050", "-0.10"]
+    assert [text.get_text() for text in demo.texts] == ["0.10", "0.20", "-0.05", "-0.10"]
 
 
 def test_what_is_not_known_is_not_drawn(content, tmp_path) -> None:

@@ -36,6 +36,9 @@ def test_published_figures_stand_beneath_ours_with_their_own_digits(content) -> 
     assert ours[head.index("speed km/h")] == "0.300"
     assert theirs[head.index("speed km/h")] == "0.32"
     assert ours[head.index("coverage %")] == "95.5"
+    content["sequences"][1]["mean"]["false_movers"] = 2.2
+    head, ours, _ = rows_of(bench_text(content), "Moving objects")
+    assert ours[head.index("false movers")] == "2.2"
 
 
 def test_each_run_has_its_line_as_in_the_paper(content) -> None:
