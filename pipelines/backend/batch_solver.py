@@ -72,7 +72,14 @@ def solve(
             problem.camera, problem.tracks, views, problem.points_m, residuals, damping
         )
         linear = linear_graph(problem, graph, values, system, views, damping)
-        delta = linear.optimize(ordering)
+        try:
+            delta = linear.optimize(ordering)
+        except RuntimeError:  # gtsam finds a pose that hardly anything holds: a shorter step
+            steps, damping = steps + 1, damping * 10.0
+            after_step()
+            if damping > _MOST_LAMBDA:
+                break
+            continue
         moved, moved_values = _moved(problem, values, delta, system, views)
         residuals_new, cost_new = cost_at(moved, moved_values)
         steps += 1

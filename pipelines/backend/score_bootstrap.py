@@ -37,6 +37,7 @@ _DRAWS = 200  # 5 % of a standard deviation
 _WORLD_PATCHES, _OBJECT_PATCHES = 32, 12  # of the image, and of what is seen of an object
 _POSE_NUMBERS, _GROUP_NUMBERS = 6.0, 2.0  # of a view, and of the mean error of a group in it
 _MOST_LEVERAGE = 0.5
+_SLIGHT_DAMPING = 1e-6  # of points: some are hardly held at all
 
 
 def bootstrap_covariances(
@@ -50,7 +51,7 @@ def bootstrap_covariances(
 
     views = problem.views(problem.Ts_world_camera, problem.Ts_world_object)
     system = eliminate_points(
-        problem.camera, problem.tracks, views, problem.points_m, residuals, damping=0.0
+        problem.camera, problem.tracks, views, problem.points_m, residuals, _SLIGHT_DAMPING
     )
     first, second, blocks, _ = pose_system(problem, system, views)
     factors = _factors(problem, graph)
