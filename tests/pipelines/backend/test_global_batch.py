@@ -2,13 +2,15 @@
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 
-from pipelines.backend import global_batch
+from pipelines.backend import batch_solver, global_batch
 from pipelines.backend.batch_outcome import corrections, objects_after, trajectory_after
 from pipelines.backend.global_batch import run_global_batch
 from pipelines.backend.guard import Verdict
+from pipelines.backend.object_graph import camera_key
 from pipelines.backend.partial_batch import run_partial_batch
 from pipelines.backend.point_motion_batch import run_point_motion_batch
 from pipelines.config import BatchConfig
@@ -95,6 +97,24 @@ def test_what_gets_worse_is_refused(make_drive, stereo, monkeypatch, what):
     step = invert_T(result.before.Ts_world_camera[3]) @ drive.objects.Ts_world_object[3]
     now = invert_T(result.after.Ts_world_camera[3]) @ rows.Ts_world_object[3]
     np.testing.assert_allclose(now, step, atol=1e-9)  # as the front-end saw it
+
+
+def test_a_step_that_cannot_be_taken_is_tried_shorter(make_drive, stereo, monkeypatch):
+    """gtsam refuses a system in which some pose is hardly held; with more damping it is."""
+    drive, right, dampings = make_drive(5), batch_solver.linear_graph, []
+
+    def refuse_first(*arguments):
+        dampings.append(arguments[-1])
+        linear = right(*arguments)
+        if len(dampings) == 1:  # a camera is worse than loose
+            linear.add(gtsam.HessianFactor(camera_key(3), -1e12 * np.eye(6), np.zeros(6), 0.0))
+        return linear
+
+    good = run_global_batch(stereo, drive.log, drive.objects, CONFIG)
+    monkeypatch.setattr(batch_solver, "linear_graph", refuse_first)
+    result = run_global_batch(stereo, drive.log, drive.objects, CONFIG)
+    assert dampings[1] == pytest.approx(10.0 * dampings[0])
+    assert result.accepted and result.cost_after == pytest.approx(good.cost_after, rel=1e-3)
 
 
 def motion_errors(H, drive):
