@@ -16,12 +16,13 @@ from pipelines.backend.held_out import HeldOut, held_out_errors
 from pipelines.backend.point_elimination import evaluate, settle_points
 from pipelines.geometry import invert_T, orthonormalise
 from pipelines.object_types import ObjectEstimates
-from pipelines.objects.motion import fuse_motions
+from pipelines.objects.motion import displacement, fuse_motions
 from pipelines.types import Array
 
 # Five times chi-square, 6 degrees of freedom, 99.9 %: real errors are not white. Of a thousand
 # motions of simulated sequences, none that the batch made better comes near both
 _RULED_OUT = 5.0 * 22.5
+_WILD_MPS = 1.0  # apart in speed, it is ruled out by the front-end's covariance alone
 _BEHIND = 100.0  # squared standard deviations that a point behind the camera counts as
 _TOLERANCE = 1.002  # of an error, up to which it is as good as before
 _SIGNIFICANT = 1.0  # standard deviations of the growth, below which it may be chance
@@ -88,7 +89,9 @@ def misfit_motions(
     objects: the front-end's rows. The held-out sightings judge an object as a whole, as a single
     motion has too few of them. Here what the two frames saw of the object, outliers of the batch
     and all, misfits the batch's motion by far more than six numbers fit by chance beside the
-    front-end's (a likelihood-ratio test), and the front-end's own covariance rules it out.
+    front-end's (a likelihood-ratio test), and the front-end's own covariance rules it out. Where
+    the speeds are far apart that alone will do, unless what was seen speaks for the batch as
+    clearly: few points fit anything.
     """
     n, growth = len(before.Ts_world_object), np.zeros(len(before.Ts_world_object))
     view = before.tracks.view - before.n_frames
@@ -105,14 +108,15 @@ def misfit_motions(
             "nij,nj->ni", invert_T(told[steps]), np.pad(objects.centers_m[rows], ((0, 0), (0, 1)),
             constant_values=1.0),
         )[:, :3]  # fmt: skip
-        surprise = fuse_motions(
-            told[steps],
-            objects.motion_covariances[rows],
-            poses[1:] @ invert_T(poses[:-1]),
-            np.zeros((len(rows), 6, 6)),
-            centers,
-        ).distance2
-        found[steps] = (growth[steps] > _RULED_OUT) & ~(surprise <= _RULED_OUT)
+        Hs = poses[1:] @ invert_T(poses[:-1])
+        none = np.zeros((len(rows), 6, 6))
+        covariances = objects.motion_covariances[rows]
+        surprise = fuse_motions(told[steps], covariances, Hs, none, centers).distance2
+        apart_m = displacement(Hs, centers) - displacement(told[steps], centers)
+        dts_s = np.diff(before.timestamps_s[stretch.frames])
+        wild = np.linalg.norm(apart_m, axis=1) > _WILD_MPS * dts_s
+        wild &= growth[steps] > -_RULED_OUT  # else what was seen proves it
+        found[steps] = ((growth[steps] > _RULED_OUT) | wild) & ~(surprise <= _RULED_OUT)
     return found
 
 
