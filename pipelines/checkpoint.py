@@ -128,7 +128,7 @@ class Checkpoints:
         head = {"version": VERSION, "origin": self._origin, "files": self._files}
         text = np.frombuffer(json.dumps(head).encode(), np.uint8)
         with replacing(self.folder / STATE) as path:
-            path.write_bytes(_npz({_HEAD: text, **changing.arrays(root)}))
+            np.savez(path, **{_HEAD: text, **changing.arrays(root)})  # type: ignore[arg-type]
         for path in self._stores():
             if path.name not in self._files:
                 path.unlink(missing_ok=True)
