@@ -33,8 +33,25 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--viewer", metavar="NAME", help="watch the run: meshcat, in the browser")
     _add_server(parser)
     _add_maps(parser)
+    _add_resume(parser)
     _add_settings(parser)
     _add_output(parser)
+
+
+def _add_resume(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with the interrupted run in --output (default: the latest), as if it had not "
+        "been; data and settings must be the same",
+    )
+    parser.add_argument(
+        "--checkpoint",
+        type=_not_negative,
+        default=50,
+        metavar="N",
+        help="write what --resume needs every N frames and at Ctrl-C (default: 50; 0: never)",
+    )
 
 
 def _add_simulation(parser: argparse.ArgumentParser) -> None:

@@ -44,6 +44,7 @@ run DATA --dataset tum_rgbd --frames 100 --stride 2
 run simulated:street --degrade --seed 7
 run DATA --set orb.n_features=1500 --output my_result
 run DATA --viewer meshcat       # watch it in the browser
+run DATA --output my_result --resume    # after Ctrl-C, or a crash
 run DATA --save-map my_map      # and later, where the map is known:
 run DATA --load-map my_map --localize""",
     ),

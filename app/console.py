@@ -92,6 +92,12 @@ class Progress:
                 f"  {self._done} of {self._n_frames} frames, {rate}{lost}", highlight=False
             )
 
+    def go_on(self, n_done: int) -> None:
+        stderr.print(f"  resumed after {n_done} frames", highlight=False)
+        self._done = n_done
+        if self._bar is not None:
+            self._bar.update(self._task, completed=n_done)
+
     def finish(self) -> None:
         if self._bar is not None:
             self._bar.stop()
@@ -166,7 +172,10 @@ def metrics(metrics: dict[str, Any], timings: dict[str, Any], folder: str) -> No
         stdout.print(Text(line, style="bold" if heading else ""), soft_wrap=True)
     say(f"\nResult: {folder}")
     if metrics.get("run", {}).get("interrupted"):
-        stdout.print("Stopped before the end: the result holds the frames until then.", **_PLAIN)
+        stdout.print(
+            "Stopped before the end: the result holds the frames until then; the same command with "
+            "--resume goes on.", **_PLAIN
+        )  # fmt: skip
 
 
 _PLAIN: dict[str, Any] = {"highlight": False, "markup": False, "soft_wrap": True}

@@ -42,7 +42,16 @@ def run(arguments: Namespace) -> int:
             options["progress"] = progress
         sequence = open_sequence(arguments.path, arguments.dataset, arguments.sequence, **options)
     span = {"start": arguments.start, "frames": arguments.frames, "stride": arguments.stride}
-    result = _process(sequence, config, arguments, span, viewer=viewer, lasting_map=maps)
+    result = _process(
+        sequence,
+        config,
+        arguments,
+        span,
+        viewer=viewer,
+        lasting_map=maps,
+        resume=arguments.resume,
+        checkpoint_every=arguments.checkpoint,
+    )
     folder = console.shorten(result.folder)
     if arguments.quiet:
         console.say(folder)

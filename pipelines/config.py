@@ -94,7 +94,8 @@ class MappingConfig:
     """Step 10: sparse map."""
 
     keyframe_min_overlap: float = 0.7  # share of tracked points that the last keyframe saw
-    keyframe_max_interval: int = 20  # frames between keyframes at most
+    keyframe_max_interval: int = 20  # frames between keyframes at most, while the camera moves
+    keyframe_min_motion_px: float = 3.0  # px, median in the image since the last keyframe
     min_points_apart_px: float = 5.0  # px, new points keep this far from tracked ones
     local_keyframes: int = 20  # keyframes of the local map by shared points; as many by place
     near_keyframe_baselines: float = 15.0  # keyframes this near in place join the local map

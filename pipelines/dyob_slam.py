@@ -11,7 +11,8 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +106,7 @@ class DyObSlam:
         self._lost_frames = 0
         self._static_tracks = Tracks.empty()  # of the last frame
         self._timings_ms: dict[str, float] = {}
+        self._perception = (self._segmentation.__getstate__(), self._flow.__getstate__())
 
     def process(self, frame: Frame | PreparedFrame) -> FrameResult:
         """Track one frame: camera, objects, map. Frames must come in order of time.
@@ -113,7 +115,7 @@ class DyObSlam:
         track is no error but the result's status. Raises as `prepare`.
         """
         prepared = self.prepare(frame) if isinstance(frame, Frame) else frame
-        self._timings_ms = dict(prepared.timings_ms)
+        self._timings_ms, self._perception = dict(prepared.timings_ms), prepared.perception
         # 11. What local bundle adjustment made better; never while a frame is under way
         with self._stage("backend"):
             self._take_correction()
@@ -179,7 +181,31 @@ class DyObSlam:
             flow_prev_to_curr_px=flow_px,
             flow_is_given=self._flow.is_given,
             timings_ms=spent,
+            perception=(self._segmentation.__getstate__(), self._flow.__getstate__()),
         )
+
+    # ------------------------------------------------------------------ state
+
+    def fixed_parts(self) -> dict[str, object]:
+        """By name, what is the same in another system of this camera and these settings."""
+        parts = {f"config.{f.name}": getattr(self.config, f.name) for f in fields(self.config)}
+        parts |= {"config": self.config, "camera": self.camera}
+        return parts | {"orb": self._orb, "worker": self._backend.worker}
+
+    def state(self) -> dict[str, Any]:
+        """All that the next frames depend on besides `fixed_parts`, for `restore`; not a copy.
+
+        To be asked between two frames; one may be in preparation then.
+        """
+        segmentation, flow = self._perception
+        own = {k: v for k, v in vars(self).items() if k not in ("_segmentation", "_flow")}
+        return {"system": {**own, "_stereo": None}, "segmentation": segmentation, "flow": flow}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on as the system of this `state`, which had the same `fixed_parts`, would have."""
+        vars(self).update(state["system"])
+        self._segmentation.__setstate__(state["segmentation"])
+        self._flow.__setstate__(state["flow"])
 
     def static_map(self) -> StaticMap:
         """The sparse static map as it stands, copied."""

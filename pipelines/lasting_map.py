@@ -46,6 +46,11 @@ class LastingMap:
                 "--localize, which leaves it as it is; leave one of the two out"
             )
 
+    def origin(self) -> dict[str, str | bool | None]:
+        """What must be the same for an interrupted run to go on."""
+        load, save = (None if p is None else str(Path(p).resolve()) for p in (self.load, self.save))
+        return {"load": load, "save": save, "localize": self.localize}
+
     def settings(self, config: Config) -> Config:
         """The settings of the run: no batch against a fixed map, as it would move that map."""
         if not self.localize:
@@ -53,7 +58,7 @@ class LastingMap:
         return replace(config, batch=replace(config.batch, at_end=False, record=False))
 
     def open(self, camera: StereoCamera, config: MappingConfig) -> SparseMap | None:
-        """The map to begin with, if any; both folders are checked before the run.
+        """The map to begin with, if any; the folder to write is checked before the run, too.
 
         Raises FormatError where there is no map, it is damaged, newer or another camera's, and
         DyObError where the folder to write holds anything but a map.
@@ -62,18 +67,22 @@ class LastingMap:
             check_map_target(Path(self.save))
         if self.load is None:
             return None
-        known = load_map(self.load, camera, config)
-        load_map_objects(self.load)
-        return known
+        return load_map(self.load, camera, config)
 
-    def keep(self, sparse_map: SparseMap, results: Sequence[FrameResult]) -> None:
+    def objects(self) -> ObjectEstimates:
+        """The objects that were met before this run, as the loaded map tells."""
+        return ObjectEstimates.empty() if self.load is None else load_map_objects(self.load)
+
+    def keep(
+        self, sparse_map: SparseMap, results: Sequence[FrameResult], earlier: ObjectEstimates
+    ) -> None:
         """Write the map with all objects met so far, if it is to be saved.
 
-        Objects of this run get numbers after those of the map. Raises DyObError as `save_map`.
+        earlier: `objects` when the run began, as the map may have been saved in the same folder
+        since. Those of this run get numbers after them. Raises DyObError as `save_map`.
         """
         if self.save is None:
             return
-        earlier = ObjectEstimates.empty() if self.load is None else load_map_objects(self.load)
         met = [r.objects for r in results if r.status is TrackingStatus.OK]  # else nobody knows
         new = ObjectEstimates.concatenate(ObjectEstimates.empty(), *met)
         new = replace(new, object_id=new.object_id + earlier.object_id.max(initial=0))

@@ -10,6 +10,7 @@ import logging
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as LateError
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,15 @@ class Segmentation:
         self._n_seen = 0
         self._pool: ThreadPoolExecutor | None = None
         self._late: tuple[int, Future[Detections]] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the network; a late answer would be of no use."""
+        return {**vars(self), "_detector": None, "_pool": None, "_late": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        if self.name:
+            self._detector = load_detector(replace(self.config, name=self.name))
 
     def detect(self, frame: Frame) -> Detections | None:
         """Masks of a frame, or None where there is no answer for it.
@@ -115,6 +125,15 @@ class DenseFlow:
         self._name = ""
         self._fallback: Flow | None = None
         self._previous: Frame | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the methods, which remember nothing."""
+        return {**vars(self), "_method": None, "_fallback": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        if self._name:
+            self._method = load_flow(replace(self.config, name=self._name))
 
     def compute(self, frame: Frame) -> NDArray[np.float32] | None:
         """Flow (H, W, 2) from the frame before, on its grid; None for the first frame.

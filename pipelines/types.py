@@ -251,6 +251,7 @@ class FrameResult:
     keypoints_px: (N, 2) places where points of the map were found. point_ids: (N,) int64, these
         points; -1 would stand for a keypoint of none. inliers: (N,) bool, whether the observation
         agreed with the pose.
+    n_inliers: how many; counted where it is not given.
     reprojection_rmse_px: of the inliers' pixels (u_L, v), NaN where there are none.
     objects: rows of all objects that are being tracked. object_labels: (H, W) int32, pixels of each
         by its lasting id, 0 elsewhere; None where there are no objects.
@@ -274,14 +275,28 @@ class FrameResult:
     object_labels: NDArray[np.int32] | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
     observations: FrameObservations | None = None
+    n_inliers: int = -1
 
     def __post_init__(self) -> None:
         N = len(self.keypoints_px)
+        if self.n_inliers < 0:
+            object.__setattr__(self, "n_inliers", int(self.inliers.sum()))
         check_shape("FrameResult", "T_world_camera", self.T_world_camera, (4, 4))
         check_shape("FrameResult", "pose_covariance", self.pose_covariance, (6, 6))
         check_shape("FrameResult", "keypoints_px", self.keypoints_px, (N, 2))
         check_shape("FrameResult", "point_ids", self.point_ids, (N,))
         check_shape("FrameResult", "inliers", self.inliers, (N,))
+
+    def summary(self) -> FrameResult:
+        """What a run keeps of each frame: all but points, pixels and observations."""
+        return replace(
+            self,
+            keypoints_px=np.empty((0, 2)),
+            point_ids=np.empty(0, np.int64),
+            inliers=np.zeros(0, bool),
+            object_labels=None,
+            observations=None,
+        )
 
 
 @dataclass(frozen=True, slots=True)

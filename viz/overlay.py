@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import queue
 import threading
+import time
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -31,6 +32,7 @@ from viz.object_marks import (
     object_counts,
 )
 
+_POLL_S = 0.002
 _WAKE_S = 0.5  # s, after which a thread that should be at its end is called again
 logger = logging.getLogger("dyob.viz")
 
@@ -203,6 +205,15 @@ class FrameWriter:
         light = replace(frame, image_right=None, depth_m=None, flow_prev_to_curr_px=None)
         self._queue.put((light, result))
 
+    def go_on(self, n_done: int) -> None:
+        """Count from so many frames on, whose pictures an interrupted run has drawn."""
+        self._n_seen = n_done
+
+    def flush(self) -> None:
+        """Wait until all that was handed over is drawn; the thread goes on."""
+        while self._thread is not None and self._thread.is_alive() and self._queue.unfinished_tasks:
+            time.sleep(_POLL_S)
+
     def finish(self) -> None:
         """Wait until all that was handed over is written."""
         if self._thread is None:
@@ -216,15 +227,17 @@ class FrameWriter:
 
     def _write_all(self) -> None:
         while (item := self._queue.get()) is not None:
-            if self._failed:
-                continue  # keep the queue flowing, so that the run loop never waits for nothing
-            frame, result = item
-            try:
-                path = self.folder / f"{frame.index:06d}{self.suffix}"
-                write_image(path, draw_frame(frame, result), sync=False)
-            except DyObError as error:
-                self._failed = True
-                logger.warning("no more annotated frames: %s", error)
+            if not self._failed:  # else keep the queue flowing: the run loop waits for it
+                self._write(*item)
+            self._queue.task_done()
+
+    def _write(self, frame: Frame, result: FrameResult) -> None:
+        try:
+            path = self.folder / f"{frame.index:06d}{self.suffix}"
+            write_image(path, draw_frame(frame, result), sync=False)
+        except DyObError as error:
+            self._failed = True
+            logger.warning("no more annotated frames: %s", error)
 
 
 def write_image(path: Path | str, image: Image, *, sync: bool = True, compression: int = 1) -> None:

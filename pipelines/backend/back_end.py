@@ -13,10 +13,9 @@ same run moves the same map at the same frame, in a process or in this one.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -29,12 +28,18 @@ from pipelines.backend.bundle_adjustment import (
 from pipelines.backend.local_window import BundleWindow, local_window, to_correction
 from pipelines.backend.loop_adjustment import (
     LoopAnswer,
+    LoopQuestion,
     adjust_loop,
     loop_adjustment_correction,
     loop_question,
 )
 from pipelines.backend.loop_detection import FEWEST_KEYFRAMES, LoopClosure, LoopDetector
-from pipelines.backend.pose_graph import build_pose_graph, loop_correction, solve_pose_graph
+from pipelines.backend.pose_graph import (
+    PoseGraph,
+    build_pose_graph,
+    loop_correction,
+    solve_pose_graph,
+)
 from pipelines.backend.seen_places import SeenPlaces
 from pipelines.backend.worker import InlineWorker, ProcessWorker, Worker
 from pipelines.config import BackendConfig
@@ -42,7 +47,7 @@ from pipelines.frontend.sensor import Sensor
 from pipelines.geometry import invert_T, rotation_angle_deg
 from pipelines.mapping.correction import MapCorrection
 from pipelines.mapping.sparse_map import SparseMap
-from pipelines.types import Features
+from pipelines.types import Array, Features
 
 _MIN_AGREEING = 0.5  # share of observations; where fewer agree, something else is wrong
 _MAX_MOVE_M, _MAX_MOVE_SHARE = 0.05, 0.02  # of a keyframe, and of its way from the held ones
@@ -52,20 +57,95 @@ _GROWN = 1.2  # times the keyframes of the last full adjustment: worth another, 
 _log = logging.getLogger("dyob.backend")
 
 
-@dataclass(frozen=True, slots=True)
-class _Question:
-    """Work under way. what: for people. due: the count of frames at which its answer is applied.
+class _Question(Protocol):
+    """Work to be done. what: for people. due: the count of frames at which its answer is applied.
 
-    judge: makes a correction of the answer, or says why it is refused. closes: the loop that it
-    does, if it is the pose graph's. is_full: whether it is the full adjustment.
+    ask: hands it to a worker, which answers the same however often. judge: makes a correction of
+    the answer, or says why it is refused. closes: the loop that it does, if it is the pose graph's.
+    is_full: whether it is the full adjustment.
     """
 
-    what: str
-    answer: Future[Any]
+    what: ClassVar[str]
+    is_full: ClassVar[bool]
+
+    @property
+    def due(self) -> int: ...
+
+    @property
+    def closes(self) -> LoopClosure | None: ...
+
+    def ask(self, worker: Worker) -> Future[Any]: ...
+
+    def judge(self, answer: Any) -> MapCorrection | str: ...
+
+
+@dataclass(frozen=True, slots=True)
+class ClosingQuestion:
+    """Where all keyframes go when a loop is closed by the pose graph."""
+
+    what: ClassVar[str] = "loop closing"
+    is_full: ClassVar[bool] = False
     due: int
-    judge: Callable[[Any], MapCorrection | str]
+    graph: PoseGraph
+    closes: LoopClosure
+
+    def ask(self, worker: Worker) -> Future[Any]:
+        """As of `_Question`."""
+        return worker.submit(solve_pose_graph, self.graph)
+
+    def judge(self, answer: Array) -> MapCorrection:
+        """As of `_Question`."""
+        return loop_correction(self.graph, answer, self.closes)
+
+
+@dataclass(frozen=True, slots=True)
+class WindowQuestion:
+    """Where the latest keyframes and their points go."""
+
+    what: ClassVar[str] = "local bundle adjustment"
+    is_full: ClassVar[bool] = False
+    due: int
+    window: BundleWindow
+    rounds: int
+    iterations: int
     closes: LoopClosure | None = None
-    is_full: bool = False
+
+    def ask(self, worker: Worker) -> Future[Any]:
+        """As of `_Question`."""
+        return worker.submit(adjust_bundle, self.window.problem, self.rounds, self.iterations)
+
+    def judge(self, answer: BundleSolution) -> MapCorrection | str:
+        """As of `_Question`."""
+        return reason_to_refuse(self.window, answer) or to_correction(self.window, answer)
+
+
+@dataclass(frozen=True, slots=True)
+class SettlingQuestion:
+    """Where all of a map goes in which a loop is closed."""
+
+    what: ClassVar[str] = "full bundle adjustment"
+    is_full: ClassVar[bool] = True
+    due: int
+    question: LoopQuestion
+    config: BackendConfig
+    closes: LoopClosure | None = None
+
+    def ask(self, worker: Worker) -> Future[Any]:
+        """As of `_Question`."""
+        return worker.submit(adjust_loop, self.question, self.config)
+
+    def judge(self, answer: LoopAnswer) -> MapCorrection | str:
+        """As of `_Question`."""
+        reason = reason_to_refuse_all(answer.problem, answer.solution)
+        if reason is not None:
+            return reason
+        _log.info(
+            "loop settled: %d keyframes and %d points, %d of them mapped twice",
+            len(answer.problem.held),
+            len(answer.point_ids),
+            len(answer.duplicates),
+        )
+        return loop_adjustment_correction(answer)
 
 
 class BackEnd:
@@ -84,6 +164,7 @@ class BackEnd:
         self.sensor, self.config = sensor, config
         self.worker = worker or (ProcessWorker() if config.process else InlineWorker())
         self._question: _Question | None = None
+        self._answer: Future[Any] | None = None
         self._closed: LoopClosure | None = None  # the latest that the map has closed, not settled
         self._must_settle = False  # at once, as the pose graph had to close it
         self._n_settled = 0  # keyframes in the last full adjustment
@@ -91,6 +172,10 @@ class BackEnd:
         self._n_frames = 0
         self._warned = self._is_started = False
         self.n_applied = self.n_refused = self.n_loops = self.n_full = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the answer that is awaited: its question is asked again."""
+        return {**vars(self), "_answer": None, "_is_started": False}
 
     def take(self) -> MapCorrection | None:
         """The correction that is due, if one is; to be called once a frame, before tracking.
@@ -102,8 +187,9 @@ class BackEnd:
         question = self._question
         if question is None:
             return None
+        answer = self._awaited(question)
         late = self._n_frames >= question.due
-        if not (late if self.config.wait else question.answer.done()):
+        if not (late if self.config.wait else answer.done()):
             return None
         return self._judge(question)
 
@@ -120,9 +206,10 @@ class BackEnd:
 
     def _judge(self, question: _Question) -> MapCorrection | None:
         """The correction that the question has led to, once its answer is there."""
-        self._question = None
+        answer = self._awaited(question)
+        self._question = self._answer = None
         try:
-            verdict = question.judge(question.answer.result())
+            verdict = question.judge(answer.result())
         except Exception as error:  # of any kind: the run does not depend on it
             self._warn(question.what, error)
             return None
@@ -172,12 +259,18 @@ class BackEnd:
         _log.info("loop: frame %d sees the place of frame %d", *frames)
         graph = build_pose_graph(sparse_map, [loop])
         due = self._due(len(graph.i) * _OBSERVATIONS_PER_EDGE)
-        answer = self.worker.submit(solve_pose_graph, graph)
         self.n_loops += 1
-        self._question = _Question(
-            "loop closing", answer, due, lambda Ts: loop_correction(graph, Ts, loop), loop
-        )
+        self._ask(ClosingQuestion(due, graph, loop))
         return True
+
+    def _ask(self, question: _Question) -> None:
+        self._question, self._answer = question, question.ask(self.worker)
+
+    def _awaited(self, question: _Question) -> Future[Any]:
+        """The answer to come; it is asked for again where a run was interrupted meanwhile."""
+        if self._answer is None:
+            self._answer = question.ask(self.worker)
+        return self._answer
 
     def _start_worker(self) -> None:
         """Start the process before there is a question, so that no answer waits for that."""
@@ -190,13 +283,8 @@ class BackEnd:
         window = local_window(sparse_map, self.sensor, config)
         if window is None:
             return
-
-        def judge(solution: BundleSolution) -> MapCorrection | str:
-            return reason_to_refuse(window, solution) or to_correction(window, solution)
-
-        answer = self.worker.submit(adjust_bundle, window.problem, config.rounds, config.iterations)
         due = self._due(len(window.problem.tracks))
-        self._question = _Question("local bundle adjustment", answer, due, judge)
+        self._ask(WindowQuestion(due, window, config.rounds, config.iterations))
 
     def _settle_loop(self, sparse_map: SparseMap, loop: LoopClosure) -> None:
         """Ask for the full adjustment of a map in which a loop is closed."""
@@ -206,21 +294,7 @@ class BackEnd:
         most = self.config.points_per_keyframe * len(sparse_map.keyframes)
         n = len(question.seen)
         due = self._due(min(n, most) if most else n)
-        answer = self.worker.submit(adjust_loop, question, self.config)
-
-        def judge(answer: LoopAnswer) -> MapCorrection | str:
-            reason = reason_to_refuse_all(answer.problem, answer.solution)
-            if reason is not None:
-                return reason
-            _log.info(
-                "loop settled: %d keyframes and %d points, %d of them mapped twice",
-                len(answer.problem.held),
-                len(answer.point_ids),
-                len(answer.duplicates),
-            )
-            return loop_adjustment_correction(answer)
-
-        self._question = _Question("full bundle adjustment", answer, due, judge, is_full=True)
+        self._ask(SettlingQuestion(due, question, self.config))
 
     def _due(self, n_observations: int) -> int:
         """The count of frames at which the answer to a question of some size is applied."""
@@ -230,7 +304,7 @@ class BackEnd:
 
     def close(self) -> None:
         """End the process, if there is one; an answer that is under way never comes."""
-        self._question = self._closed = None
+        self._question = self._answer = self._closed = None
         self._must_settle = False
         self.worker.close()
 

@@ -126,10 +126,15 @@ def build_problem(
     view = np.full(len(sightings), -1, np.int64)
     static = known & (sightings.object_id == STATIC)
     body[static], view[static] = 0, position[static]
+    by_object = np.argsort(sightings.object_id, kind="stable")
+    ids = np.array([stretch.object_id for stretch in stretches], np.int64)
+    begins, ends = (
+        np.searchsorted(sightings.object_id, ids, side, by_object) for side in ("left", "right")
+    )
     for s, stretch in enumerate(stretches):
         first, last = stretch.frames[0], stretch.frames[-1]
-        own = known & (sightings.object_id == stretch.object_id)
-        own &= (position >= first) & (position <= last)
+        own = by_object[begins[s] : ends[s]]
+        own = own[known[own] & (position[own] >= first) & (position[own] <= last)]
         body[own], view[own] = s + 1, F + stretch.first_pose + position[own] - first
     tracks, rows = build_tracks(sightings, body, view, position, F + len(Ls))
     problem = BatchProblem(

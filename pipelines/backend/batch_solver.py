@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.backend.batch_problem import BatchProblem
-from pipelines.backend.object_graph import camera_key, object_key
+from pipelines.backend.object_graph import PoseFactors, camera_key, object_key
 from pipelines.backend.point_elimination import (
     Residuals,
     ViewSystem,
@@ -49,7 +49,7 @@ class Solution:
 
 def solve(
     problem: BatchProblem,
-    graph: gtsam.NonlinearFactorGraph,
+    graph: gtsam.NonlinearFactorGraph | PoseFactors,
     keep_uv: NDArray[np.bool_],
     keep_disparity: NDArray[np.bool_],
     max_steps: int,
@@ -126,7 +126,7 @@ def make_ordering(problem: BatchProblem) -> gtsam.Ordering:
 
 def linear_graph(
     problem: BatchProblem,
-    graph: gtsam.NonlinearFactorGraph,
+    graph: gtsam.NonlinearFactorGraph | PoseFactors,
     values: gtsam.Values,
     system: ViewSystem,
     views: Array,

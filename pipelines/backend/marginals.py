@@ -13,7 +13,7 @@ import numpy as np
 
 from pipelines.backend.batch_problem import BatchProblem, Stretch
 from pipelines.backend.batch_solver import adjoint, linear_graph, make_ordering, to_values
-from pipelines.backend.object_graph import camera_key, object_key
+from pipelines.backend.object_graph import PoseFactors, camera_key, object_key
 from pipelines.backend.point_elimination import Residuals, eliminate_points
 from pipelines.geometry import invert_T
 from pipelines.types import Array
@@ -41,7 +41,7 @@ class PoseCovariances:
 
 
 def pose_covariances(
-    problem: BatchProblem, graph: gtsam.NonlinearFactorGraph, residuals: Residuals
+    problem: BatchProblem, graph: PoseFactors, residuals: Residuals
 ) -> PoseCovariances:
     """Marginals of all poses. graph: the gtsam factors between poses. residuals: at the optimum."""
     views = problem.views(problem.Ts_world_camera, problem.Ts_world_object)

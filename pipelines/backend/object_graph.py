@@ -37,36 +37,76 @@ def object_key(o: int) -> int:
     return int(gtsam.symbol("l", o))
 
 
-def pose_graph(
-    problem: BatchProblem, config: BatchConfig, n_held: int = 1
-) -> gtsam.NonlinearFactorGraph:
+class PoseFactors:
+    """Factors between poses in parts, each seen with its own poses alone.
+
+    gtsam hands every custom factor a copy of all values: with those of a whole run its cost would
+    grow with the square of the run's length.
+    """
+
+    def __init__(self) -> None:
+        self._parts: list[tuple[gtsam.NonlinearFactorGraph, list[int]]] = []
+
+    def add_part(self, graph: gtsam.NonlinearFactorGraph, keys: list[int]) -> None:
+        """Factors between these poses."""
+        self._parts.append((graph, keys))
+
+    def error(self, values: gtsam.Values) -> float:
+        """Of all parts, as gtsam's graph says it."""
+        return float(sum(graph.error(_chosen(values, keys)) for graph, keys in self._parts))
+
+    def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
+        """All parts, as gtsam's graph does it."""
+        import gtsam
+
+        linear = gtsam.GaussianFactorGraph()
+        for graph, keys in self._parts:
+            linear.push_back(graph.linearize(_chosen(values, keys)))
+        return linear
+
+
+def _chosen(values: gtsam.Values, keys: list[int]) -> gtsam.Values:
+    import gtsam
+
+    chosen = gtsam.Values()
+    for key in keys:
+        chosen.insert(key, values.atPose3(key))
+    return chosen
+
+
+def pose_graph(problem: BatchProblem, config: BatchConfig, n_held: int = 1) -> PoseFactors:
     """Priors on the first cameras and on the first pose of each stretch, and smoothness.
 
     n_held: how many cameras are held where they are.
     """
-    graph = gauge_graph(problem, n_held)
+    import gtsam
+
+    factors = gauge_graph(problem, n_held)
     for stretch in problem.stretches:
-        o = stretch.first_pose
+        graph, o = gtsam.NonlinearFactorGraph(), stretch.first_pose
         times = problem.timestamps_s[stretch.frames]
         for n in range(2, len(stretch)):
             graph.add(_smoothness(o + n, np.diff(times[n - 2 : n + 1]), config))
         if config.planar_sigma > 0.0 and stretch.class_name in ROAD_VEHICLES:
             _add_planar(graph, problem, stretch, config.planar_sigma)
-    return graph
+        factors.add_part(graph, [object_key(o + n) for n in range(len(stretch))])
+    return factors
 
 
-def gauge_graph(problem: BatchProblem, n_held: int = 1) -> gtsam.NonlinearFactorGraph:
+def gauge_graph(problem: BatchProblem, n_held: int = 1) -> PoseFactors:
     """The priors alone, without which the poses could all move together."""
     import gtsam
 
-    graph = gtsam.NonlinearFactorGraph()
+    graph, keys = gtsam.NonlinearFactorGraph(), []
     gauge = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([_GAUGE_RAD, _GAUGE_M], 3))
-    for k, T in enumerate(problem.Ts_world_camera[:n_held]):
-        graph.add(gtsam.PriorFactorPose3(camera_key(k), gtsam.Pose3(T), gauge))
-    for stretch in problem.stretches:
-        begin = gtsam.Pose3(problem.Ts_world_object[stretch.first_pose])
-        graph.add(gtsam.PriorFactorPose3(object_key(stretch.first_pose), begin, gauge))
-    return graph
+    held = [(camera_key(k), T) for k, T in enumerate(problem.Ts_world_camera[:n_held])]
+    firsts = [stretch.first_pose for stretch in problem.stretches]
+    for key, T in held + [(object_key(o), problem.Ts_world_object[o]) for o in firsts]:
+        graph.add(gtsam.PriorFactorPose3(key, gtsam.Pose3(T), gauge))
+        keys.append(key)
+    factors = PoseFactors()
+    factors.add_part(graph, keys)
+    return factors
 
 
 def _smoothness(o: int, dts_s: Array, config: BatchConfig) -> gtsam.CustomFactor:

@@ -162,13 +162,17 @@ def _whiten(
 
 
 def _point_system(seen: _Rows, tracks: PointTracks, damping: float) -> tuple[Array, Array]:
-    """Inverses (P, 3, 3) of the points' own normal matrices, and their right sides (P, 3)."""
+    """Roots (P, 3, 3) of the inverses of the points' own normal matrices, and their right sides.
+
+    With H = L L' the root is inv(L'): inv(H) itself, of a far point that is hardly known along its
+    ray, would be rounded so coarsely that what is left of the views were no longer definite.
+    """
     H = sum_by_track(seen.A.transpose(0, 2, 1) @ seen.A, tracks)
     g = sum_by_track(np.einsum("nij,ni->nj", seen.A, seen.rows), tracks)
     scale = np.trace(H, axis1=1, axis2=2)[:, None]
     corner = np.arange(3)
     H[:, corner, corner] += damping * H[:, corner, corner] + 1e-9 * scale + 1e-12
-    return np.linalg.inv(H), g
+    return np.linalg.inv(np.linalg.cholesky(H)).transpose(0, 2, 1), g
 
 
 def eliminate_points(
@@ -185,7 +189,7 @@ def eliminate_points(
     H_inverse, g = np.empty((tracks.n_tracks, 3, 3)), np.empty((tracks.n_tracks, 3))
     pull = np.empty((len(tracks), 6))
     C = np.empty((len(tracks), 3, 6), np.float32)  # the largest array: twice as long runs fit
-    parts: list[Blocks] = [sum_blocks(np.empty(0, int), np.empty(0, int), np.empty((0, 6, 6)), V)]
+    parts: list[Blocks] = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 6, 6)))]
     for own, rows, part in tracks.parts(_SIGHTINGS_A_PART):
         few = Residuals(
             residuals.uv[rows],
@@ -195,16 +199,18 @@ def eliminate_points(
             0.0,
         )
         seen = _whiten(camera, part, Ts_body_camera, points_m[own], few)
-        H_inverse[own], g[own] = _point_system(seen, part, damping)
-        blocks, pull[rows], C[rows] = _eliminate_part(part, seen, H_inverse[own], g[own])
+        root, g[own] = _point_system(seen, part, damping)
+        H_inverse[own] = root @ root.transpose(0, 2, 1)
+        blocks, pull[rows], C[rows] = _eliminate_part(part, seen, root, g[own])
         gradient += np.stack([np.bincount(part.view, column, V) for column in pull[rows].T], -1)
-        first, second, values = (np.concatenate(x) for x in zip(*parts, *blocks, strict=True))
-        parts = [sum_blocks(first, second, values, V)]
-    return ViewSystem(*parts[0], gradient, pull, H_inverse, g, C, tracks)
+        parts.append(_sum_all(blocks, V))
+        if sum(len(first) for first, _, _ in parts[1:]) > len(parts[0][0]):  # else not worth it yet
+            parts = [_sum_all(parts, V)]
+    return ViewSystem(*_sum_all(parts, V), gradient, pull, H_inverse, g, C, tracks)
 
 
 def _eliminate_part(
-    tracks: PointTracks, seen: _Rows, H_inverse: Array, g: Array
+    tracks: PointTracks, seen: _Rows, root: Array, g: Array
 ) -> tuple[list[Blocks], Array, Array]:
     """Blocks of the views' system, pull (N, 6) on the view of each sighting, and C (N, 3, 6)."""
     rows, view, V = seen.rows, tracks.view, tracks.n_views
@@ -219,14 +225,15 @@ def _eliminate_part(
     C += np.roll(seen.A[:, :2], -1, axis=0).transpose(0, 2, 1) @ after
     pull = np.einsum("nij,ni->nj", B, rows)
     pull += np.einsum("nij,ni->nj", after, np.roll(rows[:, :2], -1, axis=0))
-    pull -= np.einsum("nij,ni->nj", C, np.einsum("pij,pj->pi", H_inverse, g)[tracks.track])
+    best = np.einsum("pij,pj->pi", root, np.einsum("pji,pj->pi", root, g))
+    pull -= np.einsum("nij,ni->nj", C, best[tracks.track])
     now = np.flatnonzero(tracks.is_followed)
     cross = before[now].transpose(0, 2, 1) @ B[now, :2]
     own = B.transpose(0, 2, 1) @ B + after.transpose(0, 2, 1) @ after
     blocks = [
         sum_blocks(view, view, own, V),
         sum_blocks(view[now - 1], view[now], cross, V),
-        *_eliminated(tracks, C, np.linalg.cholesky(H_inverse)),
+        *_eliminated(tracks, C, root),
     ]
     return blocks, pull, C
 
@@ -243,8 +250,8 @@ def settle_points(
     for _ in range(steps):
         residuals = evaluate(camera, tracks, Ts_body_camera, points_m, every, every)
         seen = _whiten(camera, tracks, Ts_body_camera, points_m, residuals)
-        H_inverse, g = _point_system(seen, tracks, _SETTLE_DAMPING)
-        points_m = points_m + np.einsum("pij,pj->pi", H_inverse, g)
+        root, g = _point_system(seen, tracks, _SETTLE_DAMPING)
+        points_m = points_m + np.einsum("pij,pkj,pk->pi", root, root, g, optimize=True)
     return points_m
 
 
@@ -256,6 +263,11 @@ def sum_blocks(first: Index, second: Index, blocks: Array, n_views: int) -> Bloc
     begins = np.searchsorted(where[order], np.arange(len(pairs)))
     summed = np.add.reduceat(blocks[order], begins, axis=0) if len(pairs) else blocks[:0]
     return pairs // n_views, pairs % n_views, summed
+
+
+def _sum_all(parts: list[Blocks], n_views: int) -> Blocks:
+    first, second, blocks = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return sum_blocks(first, second, blocks, n_views)
 
 
 def _eliminated(tracks: PointTracks, C: Array, root: Array) -> list[Blocks]:

@@ -16,7 +16,7 @@ come true within a tenth by it, where the model's were half of what they should 
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +24,11 @@ from numpy.typing import NDArray
 from pipelines.backend.batch_problem import BatchProblem
 from pipelines.backend.batch_solver import adjoint, pose_system, to_values
 from pipelines.backend.marginals import PoseCovariances
-from pipelines.backend.object_graph import camera_key, object_key
+from pipelines.backend.object_graph import PoseFactors, camera_key, object_key
 from pipelines.backend.point_elimination import Residuals, eliminate_points
 from pipelines.backend.point_tracks import Index
 from pipelines.geometry import invert_T
 from pipelines.types import Array
-
-if TYPE_CHECKING:
-    import gtsam
 
 _DRAWS = 200  # 5 % of a standard deviation
 _WORLD_PATCHES, _OBJECT_PATCHES = 32, 12  # of the image, and of what is seen of an object
@@ -41,7 +38,7 @@ _SLIGHT_DAMPING = 1e-6  # of points: some are hardly held at all
 
 
 def bootstrap_covariances(
-    problem: BatchProblem, graph: gtsam.NonlinearFactorGraph, residuals: Residuals, seed: int = 0
+    problem: BatchProblem, graph: PoseFactors, residuals: Residuals, seed: int = 0
 ) -> PoseCovariances:
     """Covariances of all poses, as `marginals.pose_covariances` has them, by the residuals.
 
@@ -68,9 +65,7 @@ def bootstrap_covariances(
     return _carried_on(of_tracks, of_patches)
 
 
-def _factors(
-    problem: BatchProblem, graph: gtsam.NonlinearFactorGraph
-) -> list[tuple[list[int], Array]]:
+def _factors(problem: BatchProblem, graph: PoseFactors) -> list[tuple[list[int], Array]]:
     """The linearised factors between poses: which poses, cameras first, and their information."""
     F, n_objects = problem.n_frames, len(problem.Ts_world_object)
     row = {camera_key(k): k for k in range(F)}

@@ -7,6 +7,7 @@ that needs what was learned of the sensor. Knows no poses.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -107,7 +108,8 @@ class PreparedFrame:
     gray: (H, W) uint8. disparity_px: (H, W) float32 as measured, NaN where unknown. features: ORB,
     without depth. detections: masks of movable things, None where there is no answer for this
     frame. flow_prev_to_curr_px: (H, W, 2) from the frame prepared before, or None; flow_is_given:
-    whether it came with the sequence. timings_ms: wall time of each stage so far.
+    whether it came with the sequence. timings_ms: wall time of each stage so far. perception: what
+    detector and flow remember after this frame, for whoever wants to go on from here.
     """
 
     frame: Frame
@@ -118,6 +120,7 @@ class PreparedFrame:
     flow_prev_to_curr_px: NDArray[np.float32] | None = None
     flow_is_given: bool = False
     timings_ms: dict[str, float] = field(default_factory=dict)
+    perception: tuple[Any, ...] = ()
 
 
 def prepare_frame(

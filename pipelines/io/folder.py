@@ -12,6 +12,7 @@ import uuid
 from pathlib import Path
 
 from pipelines.errors import DyObError, FormatError
+from pipelines.io.files import read_json
 
 CONFIG = "config.yaml"
 LOG = "run.log"
@@ -34,6 +35,7 @@ PLOTS = "plots"
 RENDERS = "renders"
 SCENE = "scene.html"  # the run in 3D, a page of its own
 REPORT = "report.html"
+CHECKPOINT = "checkpoint"  # a folder, while a run is not finished
 LATEST = "latest"
 
 logger = logging.getLogger("dyob.io")
@@ -63,22 +65,26 @@ def create_result_folder(root: Path | str, name: str, *, is_latest: bool = True)
     return folder
 
 
-def clear_result_folder(folder: Path | str) -> None:
+def clear_result_folder(folder: Path | str, *, resume: bool = False) -> None:
     """Make `folder`, or remove what an earlier run left in it: files named above, nothing else.
 
+    resume: what the frames done so far have left stays: log, observations, pictures, checkpoint.
     Raises DyObError where it holds files but is no run's, such as a folder of data.
     """
     folder = Path(folder)
     check_output(folder, LOG)
-    files = [CONFIG, LOG, CAMERA_TUM, CAMERA_KITTI, CAMERA_GT_TUM, STATIC_MAP]
+    files = [CONFIG, CAMERA_TUM, CAMERA_KITTI, CAMERA_GT_TUM, STATIC_MAP]
     files += [OBJECTS_CSV, OBJECTS_GT_CSV, NOISE_GT, CAMERA_STD, SCENE, REPORT]
     stale = [folder / name for name in (*files, METRICS_JSON, METRICS_TXT, TIMINGS)]
     stale += (folder / OBJECTS).glob("*_tum.txt")
-    stale += [*(folder / OBSERVATIONS).glob("*.npz"), *(folder / OBSERVATIONS).glob("*.json")]
     stale += [*(folder / FRONT_END).glob("*.*"), *(folder / FRONT_END / OBJECTS).glob("*_tum.txt")]
-    for name in (FRAMES, PLOTS, RENDERS):
+    for name in (PLOTS, RENDERS) if resume else (FRAMES, PLOTS, RENDERS):
         stale += [*(folder / name).glob("*.png"), *(folder / name).glob("*.jpg")]
     stale += (folder / RENDERS).glob("*.mp4")
+    if not resume:
+        stale += [folder / LOG, *(folder / OBSERVATIONS).glob("*.json")]
+        for name in (OBSERVATIONS, CHECKPOINT):
+            stale += (folder / name).glob("*.npz")
     try:
         for path in stale:
             path.unlink(missing_ok=True)
@@ -109,6 +115,27 @@ def check_output(folder: Path, mark: str) -> None:
             f"{folder}: expected a new or empty folder or an earlier result with {mark}, "
             f"found {', '.join(held[:3])}{more} in it; choose another --output"
         )
+
+
+def open_interrupted(path: Path) -> Path:
+    """The real folder behind `path`, checked to be of a run, interrupted or finished.
+
+    Raises FormatError where it is none.
+    """
+    if not (path / LOG).is_file():
+        found = f"no {LOG} in it" if path.is_dir() else "no such folder"
+        raise FormatError(
+            f"{path}: expected the folder of an interrupted run, found {found}; name it with "
+            "--output, or run without --resume"
+        )
+    return path.resolve()
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether the run of a result folder reached its end."""
+    if list((folder / CHECKPOINT).glob("*.npz")) or not (folder / METRICS_JSON).is_file():
+        return False
+    return not read_json(folder / METRICS_JSON).get("run", {}).get("interrupted", True)
 
 
 def _first_free(root: Path, base: str) -> Path:

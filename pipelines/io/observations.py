@@ -50,6 +50,33 @@ class ObservationRecorder:
             raise DyObError(disk_error(self.folder, error)) from error
         write_json(self.folder / CAMERA, asdict(camera))
 
+    def state(self) -> tuple[int, list[FrameObservations]]:
+        """How many chunks are on the disk, and the frames that are not; for `go_on`."""
+        return self._n_chunks, list(self._pending)
+
+    @classmethod
+    def go_on(
+        cls, folder: Path | str, n_chunks: int, pending: list[FrameObservations]
+    ) -> ObservationRecorder:
+        """As the recorder of this `state`; what it wrote since then is written again.
+
+        Raises FormatError where a chunk is missing.
+        """
+        recorder = cls.__new__(cls)
+        recorder.folder = Path(folder)
+        recorder._pending, recorder._n_chunks = list(pending), n_chunks
+        needed = [recorder._chunk(n) for n in range(n_chunks)]
+        for path in [*needed, recorder.folder / CAMERA]:
+            if not path.is_file():
+                raise FormatError(
+                    f"{path}: expected what the frames done so far saw, found no such file; run "
+                    "it again without --resume"
+                )
+        later = set(recorder.folder.glob("[0-9]*.npz")) - set(needed)
+        for path in [*later, recorder.folder / MAP_POINTS, recorder.folder / POSES]:
+            path.unlink(missing_ok=True)
+        return recorder
+
     def add(self, frame: FrameObservations) -> None:
         """Take in one frame."""
         self._pending.append(frame)
@@ -86,9 +113,12 @@ class ObservationRecorder:
     def _flush(self) -> None:
         if not self._pending:
             return
-        _write_chunk(self.folder / f"{self._n_chunks:06d}.npz", self._pending)
+        _write_chunk(self._chunk(self._n_chunks), self._pending)
         self._n_chunks += 1
         self._pending = []
+
+    def _chunk(self, n: int) -> Path:
+        return self.folder / f"{n:06d}.npz"
 
 
 def clear_observations(folder: Path | str) -> None:

@@ -40,7 +40,7 @@ def summarise_timings(results: Sequence[FrameResult]) -> dict[str, Any]:
     summary["frames_timestamp_s"] = [float(result.timestamp_s) for result in results]
     summary["frames_status"] = [str(result.status) for result in results]
     summary["frames_keyframe"] = [bool(result.is_keyframe) for result in results]
-    summary["frames_inliers"] = [int(result.inliers.sum()) for result in results]
+    summary["frames_inliers"] = [result.n_inliers for result in results]
     return summary
 
 

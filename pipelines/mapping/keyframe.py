@@ -33,10 +33,21 @@ def needs_keyframe(
 ) -> bool:
     """Whether a tracked frame shows enough that the last keyframe does not.
 
-    True when fewer than `keyframe_min_overlap` of the tracked points were seen by the last
-    keyframe, or after `keyframe_max_interval` frames.
+    tracks: points of earlier frames that this one has found again. True when fewer than
+    `keyframe_min_overlap` of them were seen by the last keyframe, or after `keyframe_max_interval`
+    frames; but never while the camera stands, so that keyframes are bounded by its way and turns.
     """
-    if last is None or frame_index - last.frame_index >= config.keyframe_max_interval:
+    if last is None:
         return True
-    shared = np.isin(tracks.point_ids, last.tracks.point_ids).sum()
-    return bool(shared < config.keyframe_min_overlap * max(len(tracks), 1))
+    shared = np.isin(tracks.point_ids, last.tracks.point_ids)
+    if shared.sum() < config.min_shared_points:
+        return True
+    is_due = frame_index - last.frame_index >= config.keyframe_max_interval
+    is_due |= bool(shared.sum() < config.keyframe_min_overlap * len(tracks))
+    return is_due and _image_motion_px(tracks, last.tracks) >= config.keyframe_min_motion_px
+
+
+def _image_motion_px(tracks: Tracks, before: Tracks) -> float:
+    """Median way in the image of the points that both see; they see some."""
+    _, now, then = np.intersect1d(tracks.point_ids, before.point_ids, return_indices=True)
+    return float(np.median(np.linalg.norm(tracks.uv_px[now] - before.uv_px[then], axis=1)))

@@ -62,9 +62,10 @@ class LocalMapping:
         free = self.mappable_features(view, tracks)
         budget = max(0, self.orb.n_features - len(tracks))
         new = self._add_points(sparse_map, view, tracked.T_world_camera, free[:budget])
-        tracks = Tracks.concatenate(tracks, new)
         last = sparse_map.keyframes[-1] if sparse_map.keyframes else None
+        # Without the new ones: most of what is seen for the first time is never found again
         is_keyframe = needs_keyframe(self.config, tracks, last, view.frame_index)
+        tracks = Tracks.concatenate(tracks, new)
         if is_keyframe:
             tracks = self._add_keyframe(sparse_map, view, tracked, tracks)
         if self.sensor.calibrates_disparity:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,6 +117,11 @@ class SparseMap:
         sparse_map._covisible = [others.astype(np.int64) for others, _ in covisible]
         sparse_map._n_shared = [n_shared.astype(np.int64) for _, n_shared in covisible]
         return sparse_map
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All of it, without the columns' spare capacity."""
+        used = {name: getattr(self, name)[: self._size] for name in _COLUMNS}
+        return {**vars(self), **used}
 
     def columns(self) -> dict[str, NDArray]:
         """Read-only views of all columns of points by name; a point's id is its row, dead or not.

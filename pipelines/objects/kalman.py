@@ -32,9 +32,7 @@ class ObjectFilter:
     _HIDDEN_SPEED_MPS = 5.0
 
     def __init__(self, center_m: Array, covariance_m2: Array, acceleration_mps2: float) -> None:
-        from filterpy.kalman import KalmanFilter  # takes two seconds
-
-        self._kf: Any = KalmanFilter(dim_x=6, dim_z=6)
+        self._kf = _make_filter()
         self._kf.x = np.r_[center_m, np.zeros(3)]
         self._kf.P = np.zeros((6, 6))
         self._kf.P[:3, :3] = covariance_m2
@@ -42,6 +40,15 @@ class ObjectFilter:
         self._acceleration = acceleration_mps2
         self._speeding_mps2 = 0.0  # smoothed change of the speed, as it was last measured
         self.turn_radps = np.zeros(3)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All of it; of filterpy's filter what outlasts an update."""
+        return {**vars(self), "_kf": (self._kf.x, self._kf.P)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        kf = _make_filter()
+        kf.x, kf.P = state["_kf"]
+        vars(self).update(state, _kf=kf)
 
     @property
     def center_m(self) -> Array:
@@ -180,6 +187,12 @@ class ObjectFilter:
             np.einsum("mi,mi->m", d, np.linalg.solve(S, d.T).T),
             float(np.linalg.slogdet(S)[1]),
         )
+
+
+def _make_filter() -> Any:
+    from filterpy.kalman import KalmanFilter  # takes two seconds
+
+    return KalmanFilter(dim_x=6, dim_z=6)
 
 
 def direction_std(vector: Array, covariance: Array) -> float:

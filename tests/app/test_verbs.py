@@ -130,6 +130,7 @@ def test_ctrl_c_leaves_a_valid_partial_result(tmp_path: Path) -> None:
         (["run", "simulated:demo", "--config", "no.yaml"], "cannot read the settings file no.yaml"),
         (["run", "simulated:demo", "--set", "orb.n_feature=3"], "'orb.n_features'"),
         (["run", ".", "--dataset", "vd"], "vdo"),
+        (["run", "simulated:demo", "--resume", "--output", "no/such"], "of an interrupted run"),
         (["eval", "no/such/result"], "expected a result folder, found nothing"),
         (["render", "no/such/result"], "expected a result folder, found nothing"),
     ],

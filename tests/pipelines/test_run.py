@@ -302,7 +302,8 @@ def test_ctrl_c_leaves_the_frames_done_so_far(street, tmp_path, whole, at: int) 
     witness = Witness(at, KeyboardInterrupt())
     result = run(street, output=tmp_path / "partial", sinks=[witness])
     assert witness.told == ["start"] + ["frame"] * (at + 1) + ["finish"]
-    assert names_in(result.folder) == FILES | TRAJECTORIES | {"observations"}  # no batch
+    left = FILES | TRAJECTORIES | {"observations", "checkpoint"}  # no batch
+    assert names_in(result.folder) == left
     counts = result.metrics["run"]
     assert counts["interrupted"] is True
     assert counts["frames"] == counts["tracked"] == at + 1

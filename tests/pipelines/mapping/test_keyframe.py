@@ -11,9 +11,9 @@ from pipelines.types import Features
 CONFIG = MappingConfig(keyframe_min_overlap=0.7, keyframe_max_interval=10)
 
 
-def tracks_of(ids):
+def tracks_of(ids, moved_px=0.0):
     ids = np.asarray(ids, np.int64)
-    uv = np.column_stack([ids * 1.0, ids * 2.0])
+    uv = np.column_stack([ids * 1.0 + moved_px, ids * 2.0])
     return Tracks(ids, uv, np.where(ids % 2 == 0, 5.0, np.nan), ids * 0.1)
 
 
@@ -52,19 +52,32 @@ def test_the_first_frame_is_a_keyframe():
 )
 def test_a_frame_of_many_new_points_is_a_keyframe(n_shared, expected):
     last = keyframe_of(range(100))
-    tracks = tracks_of(range(100 - n_shared, 200 - n_shared))
+    tracks = tracks_of(range(100 - n_shared, 200 - n_shared), moved_px=4.0)
     assert needs_keyframe(CONFIG, tracks, last, 3) is expected
 
 
 def test_what_the_keyframe_saw_and_is_lost_does_not_count():
     """Only the present tracks are asked: fifty old points alone need no keyframe."""
-    assert not needs_keyframe(CONFIG, tracks_of(range(50)), keyframe_of(range(400)), 3)
+    assert not needs_keyframe(CONFIG, tracks_of(range(50), 4.0), keyframe_of(range(400)), 3)
 
 
 @pytest.mark.parametrize(("frame_index", "expected"), [(14, False), (15, True), (40, True)])
 def test_a_keyframe_is_due_after_the_interval(frame_index, expected):
     last = keyframe_of(range(100), frame_index=5)
-    assert needs_keyframe(CONFIG, tracks_of(range(100)), last, frame_index) is expected
+    assert needs_keyframe(CONFIG, tracks_of(range(100), 4.0), last, frame_index) is expected
+
+
+@pytest.mark.parametrize("n_shared", [100, 40, 15])
+def test_a_camera_that_stands_makes_no_keyframe(n_shared):
+    """Neither for long, nor though much of what it sees has changed."""
+    tracks = tracks_of(range(100 - n_shared, 200 - n_shared), moved_px=2.0)
+    assert not needs_keyframe(CONFIG, tracks, keyframe_of(range(100)), 500)
+    tracks = tracks_of(range(100 - n_shared, 200 - n_shared), moved_px=4.0)
+    assert needs_keyframe(CONFIG, tracks, keyframe_of(range(100)), 500)
+
+
+def test_a_frame_that_shares_hardly_a_point_is_a_keyframe():
+    assert needs_keyframe(CONFIG, tracks_of(range(90, 190)), keyframe_of(range(100)), 3)
 
 
 def test_a_frame_without_tracks_does_not_divide_by_zero():
