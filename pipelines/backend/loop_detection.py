@@ -44,6 +44,8 @@ _MIN_INLIERS, _MIN_SHARE = 50, 0.5  # of the guided matches, for proof
 _WITHIN = 5  # keyframes
 _SAME_SHARE, _SAME_DEG = 0.03, 1.0  # of the depth of what was seen, and of direction
 _OPEN_SHARE, _OPEN_DEG = 0.005, 0.2  # less is not worth a correction
+# Copies of a house look alike to the last brick: no tracking is off by so much of its way
+_DRIFT_SHARE, _DRIFT_DEG = 0.15, 30.0
 _SEED = 0
 
 
@@ -77,6 +79,16 @@ class LoopClosure:
         far_m = float(np.linalg.norm(between[:3, 3]))
         turned_deg = float(rotation_angle_deg(between))
         return far_m <= _SAME_SHARE * self.depth_m and turned_deg <= _SAME_DEG
+
+
+def _may_be_drift(sparse_map: SparseMap, closure: LoopClosure) -> bool:
+    """Whether a camera that went from the place to the keyframe can have come to be off so far."""
+    Ts = [k.T_world_camera for k in sparse_map.keyframes[closure.place : closure.keyframe + 1]]
+    centers = np.array([T[:3, 3] for T in Ts])
+    way_m = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
+    off_m = float(np.linalg.norm(closure.T_world_camera[:3, 3] - centers[-1]))
+    most_m = _DRIFT_SHARE * way_m + _SAME_SHARE * closure.depth_m  # which may turn on the spot
+    return off_m <= most_m and float(rotation_angle_deg(closure.off)) <= _DRIFT_DEG
 
 
 class LoopDetector:
@@ -119,7 +131,7 @@ class LoopDetector:
                 break
             tried.add(place)
             closure = self._prove(sparse_map, index, place, features)
-            if closure is not None:
+            if closure is not None and _may_be_drift(sparse_map, closure):
                 return closure
         return None
 

@@ -16,6 +16,7 @@ from pipelines.mapping.keyframe import Keyframe
 from pipelines.observations import Tracks
 from pipelines.types import Features
 
+real = loop_detection._may_be_drift
 DRIFT = exp_se3(np.array([0.0, 0.02, 0.0, 0.3, 0.0, 0.2]))
 
 
@@ -70,6 +71,22 @@ def test_places_that_disagree_are_no_loop(mapped, monkeypatch) -> None:
     assert detector.take(slam.map, features[3]) is None
     come_again(slam, aside @ truth[4], features[4].descriptors)
     assert detector.take(slam.map, features[4]) is None
+
+
+def test_a_copy_of_a_house_down_the_road_is_no_loop(mapped, monkeypatch) -> None:
+    """All agrees, but nobody drifts by half of the way."""
+    sequence, slam, detector, features = mapped
+    monkeypatch.setattr(loop_detection, "_RECENT", 1)
+    truth = sequence.ground_truth().Ts_world_camera
+    truth = np.linalg.inv(truth[0]) @ truth
+    way_m = np.linalg.norm(truth[11, :3, 3])
+    far = exp_se3(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2.0 * way_m]))
+    found = []
+    monkeypatch.setattr(loop_detection, "_may_be_drift", lambda *a: found.append(a) or real(*a))
+    for k in (5, 6):
+        come_again(slam, far @ truth[k], features[k].descriptors)
+        assert detector.take(slam.map, features[k]) is None
+    assert len(found) >= 2  # they were proved but for this
 
 
 def test_what_was_never_seen_is_no_loop(mapped, monkeypatch) -> None:
