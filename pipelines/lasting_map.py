@@ -58,7 +58,7 @@ class LastingMap:
         return replace(config, batch=replace(config.batch, at_end=False, record=False))
 
     def open(self, camera: StereoCamera, config: MappingConfig) -> SparseMap | None:
-        """The map to begin with, if any; the folder to write is checked before the run, too.
+        """The map to begin with, if any; both folders are checked before the run.
 
         Raises FormatError where there is no map, it is damaged, newer or another camera's, and
         DyObError where the folder to write holds anything but a map.
@@ -67,7 +67,9 @@ class LastingMap:
             check_map_target(Path(self.save))
         if self.load is None:
             return None
-        return load_map(self.load, camera, config)
+        known = load_map(self.load, camera, config)
+        load_map_objects(self.load)
+        return known
 
     def objects(self) -> ObjectEstimates:
         """The objects that were met before this run, as the loaded map tells."""
