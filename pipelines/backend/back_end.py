@@ -234,7 +234,9 @@ class BackEnd:
         an answer is awaited. The map is copied, not changed.
         """
         n, config = len(sparse_map.keyframes), self.config
-        adjusts = config.local_adjustment and n >= config.local_from_keyframe
+        # Once a loop was settled, full adjustments keep the map: windows would only stir it
+        is_open = self._n_settled == 0 and n >= config.local_from_keyframe
+        adjusts = config.local_adjustment and is_open
         if adjusts or (config.loop_closing and n >= FEWEST_KEYFRAMES):
             self._start_worker()
         if config.loop_closing and self._close_loop(sparse_map, features):
