@@ -270,10 +270,9 @@ class BackendConfig:
     """Step 11: local bundle adjustment of the latest keyframes, and loops, beside tracking."""
 
     loop_closing: bool = True  # places seen before correct the drift since then
+    # of the latest keyframes, in a large map in which no loop was closed and settled yet
     local_adjustment: bool = True
-    # keyframes of a map before which points refined at every frame do as well: measured on runs of
-    # up to 110, where errors differ by some percent both ways; two rounds of a block err less
-    local_from_keyframe: int = 120
+    local_from_keyframe: int = 60  # in smaller maps points refined at every frame do as well
     full_adjustment: bool = True  # after a loop: all keyframes, with what both its sides mapped
     process: bool = True  # in a process of its own; false: in this one, with the same answers
     # an answer is due a fixed number of frames after its question, and waited for, so that runs

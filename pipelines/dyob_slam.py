@@ -230,7 +230,7 @@ class DyObSlam:
 
     def settle(self) -> None:
         """Wait for what the back-end has under way, and let the map follow it: after the end."""
-        while self._backend.is_busy:
+        while self._backend.is_busy(self.map):
             self._follow(self._backend.settle(self.map))
 
     def close(self) -> None:

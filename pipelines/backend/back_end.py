@@ -3,8 +3,8 @@
 Owns the one question that is under way and the judgement of its answer. What is adjusted is chosen
 by `local_window` and solved by `bundle_adjustment`; loops are found by `loop_detection`, closed by
 `pose_graph` and then settled by `loop_adjustment`; `mapping.correction` moves the map. A loop goes
-before a local adjustment, but not before the full one of the loop that was found last. Places seen
-again where they should be ask for a full one, too, whenever the map has grown by a fifth.
+before a local adjustment, but not before the full one of the loop that was found last. What sees
+old places where they should be is settled as well, whenever the map has grown by a fifth.
 
 An answer is applied a fixed number of frames after its question, however soon it is there: so the
 same run moves the same map at the same frame, in a process or in this one.
@@ -53,7 +53,7 @@ _MIN_AGREEING = 0.5  # share of observations; where fewer agree, something else 
 _MAX_MOVE_M, _MAX_MOVE_SHARE = 0.05, 0.02  # of a keyframe, and of its way from the held ones
 _MAX_TURN_DEG = 0.5  # of a keyframe
 _OBSERVATIONS_PER_EDGE = 3  # what an edge of the pose graph costs, in observations
-_GROWN = 1.2  # times the keyframes of the last full adjustment: worth another, if loops tell more
+_GROWN = 1.2  # times the keyframes of the last full adjustment, which are worth another
 _log = logging.getLogger("dyob.backend")
 
 
@@ -193,15 +193,18 @@ class BackEnd:
             return None
         return self._judge(question)
 
-    @property
-    def is_busy(self) -> bool:
-        """Whether an answer is awaited, or a question must still be asked."""
-        return self._question is not None or self._closed is not None
+    def is_busy(self, sparse_map: SparseMap) -> bool:
+        """Whether an answer is awaited, or a loop is not settled with all keyframes that there are.
+
+        For the time after the end: while frames come, what is new waits for more of it.
+        """
+        return self._question is not None or self._loop_to_settle(sparse_map, 1.0) is not None
 
     def settle(self, sparse_map: SparseMap) -> MapCorrection | None:
-        """The correction that is under way, now; to be called until nothing is, after the end."""
-        if self._question is None and self._closed is not None:
-            self._settle_loop(sparse_map, self._closed)
+        """The correction that is under way, at once; while `is_busy`, after the end."""
+        loop = self._loop_to_settle(sparse_map, 1.0)
+        if self._question is None and loop is not None:
+            self._settle_loop(sparse_map, *loop)
         return None if self._question is None else self._judge(self._question)
 
     def _judge(self, question: _Question) -> MapCorrection | None:
@@ -231,16 +234,18 @@ class BackEnd:
         an answer is awaited. The map is copied, not changed.
         """
         n, config = len(sparse_map.keyframes), self.config
-        adjusts = config.local_adjustment and n >= config.local_from_keyframe
+        # Once a loop was settled, full adjustments keep the map: windows would only stir it
+        is_open = self._n_settled == 0 and n >= config.local_from_keyframe
+        adjusts = config.local_adjustment and is_open
         if adjusts or (config.loop_closing and n >= FEWEST_KEYFRAMES):
             self._start_worker()
         if config.loop_closing and self._close_loop(sparse_map, features):
             return
         if self._question is not None:
             return
-        has_grown = n >= _GROWN * self._n_settled
-        if self._closed is not None and (self._must_settle or has_grown):
-            self._settle_loop(sparse_map, self._closed)
+        loop = self._loop_to_settle(sparse_map, _GROWN)
+        if loop is not None:
+            self._settle_loop(sparse_map, *loop)
         elif adjusts:
             self._adjust(sparse_map)
 
@@ -286,11 +291,27 @@ class BackEnd:
         due = self._due(len(window.problem.tracks))
         self._ask(WindowQuestion(due, window, config.rounds, config.iterations))
 
-    def _settle_loop(self, sparse_map: SparseMap, loop: LoopClosure) -> None:
+    def _loop_to_settle(self, sparse_map: SparseMap, growth: float) -> tuple[int, int] | None:
+        """Rows of a keyframe and of an old one that sees the same, if all should be adjusted now.
+
+        Of the loop just closed; else, in a map that has had one, of the latest keyframe, when there
+        are so many times the keyframes of the last full adjustment.
+        """
+        n, closed = len(sparse_map.keyframes), self._closed
+        has_grown = n > self._n_settled and n >= growth * self._n_settled
+        if closed is not None and (self._must_settle or has_grown):
+            return closed.keyframe, closed.place
+        if self._n_settled == 0 or not has_grown:
+            return None
+        old = sparse_map.covisible_keyframes(n - 1)
+        old = old[old < n - FEWEST_KEYFRAMES]
+        return (n - 1, int(old[0])) if len(old) else None
+
+    def _settle_loop(self, sparse_map: SparseMap, keyframe: int, place: int) -> None:
         """Ask for the full adjustment of a map in which a loop is closed."""
         self._closed, self._must_settle = None, False
         self._n_settled = len(sparse_map.keyframes)
-        question = loop_question(sparse_map, self.sensor, loop)
+        question = loop_question(sparse_map, self.sensor, keyframe, place)
         most = self.config.points_per_keyframe * len(sparse_map.keyframes)
         n = len(question.seen)
         due = self._due(min(n, most) if most else n)

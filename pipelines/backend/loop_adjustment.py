@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pipelines.backend.bundle_adjustment import BundleProblem, BundleSolution, adjust_bundle
 from pipelines.backend.duplicate_points import Pairs, find_duplicates
 from pipelines.backend.keyframe_sightings import KeyframeSightings, copy_sightings, to_tracks
-from pipelines.backend.loop_detection import LoopClosure
 from pipelines.backend.point_tracks import Index
 from pipelines.config import BackendConfig
 from pipelines.frontend.sensor import Sensor
@@ -51,19 +50,19 @@ class LoopAnswer:
     solution: BundleSolution
 
 
-def loop_question(sparse_map: SparseMap, sensor: Sensor, loop: LoopClosure) -> LoopQuestion:
-    """All of the map, copied, once a loop in it has been closed by the pose graph."""
+def loop_question(sparse_map: SparseMap, sensor: Sensor, keyframe: int, place: int) -> LoopQuestion:
+    """All of the map, copied, in which a loop is closed. keyframe, place: rows of its two ends."""
     n = len(sparse_map.keyframes)
-    middle = (loop.place + loop.keyframe) / 2
-    place, recent = _around(sparse_map, loop.place), _around(sparse_map, loop.keyframe)
-    recent = np.union1d(recent, np.arange(loop.keyframe, n))
+    middle = (place + keyframe) / 2
+    old, recent = _around(sparse_map, place), _around(sparse_map, keyframe)
+    recent = np.union1d(recent, np.arange(keyframe, n))
     columns = sparse_map.columns()
     return LoopQuestion(
         copy_sightings(sparse_map, sensor, np.arange(n), columns["alive"]),
         columns["position_m"].copy(),
         columns["descriptor"].copy(),
         recent[recent > middle],
-        place[place <= middle],
+        old[old <= middle],
     )
 
 

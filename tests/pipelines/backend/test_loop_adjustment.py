@@ -104,6 +104,10 @@ def make_drive(seed: int = 0) -> Drive:
     return Drive(sparse_map, sensor, truth, things, np.array(thing), loop)
 
 
+def question_of(drive: Drive):
+    return loop_question(drive.sparse_map, drive.sensor, drive.loop.keyframe, drive.loop.place)
+
+
 def far_off_m(Ts, truth):
     """(K,) how far each camera is from where it was."""
     return np.linalg.norm(Ts[:, :3, 3] - truth[:, :3, 3], axis=1)
@@ -112,7 +116,7 @@ def far_off_m(Ts, truth):
 @pytest.fixture(scope="module")
 def asked():
     drive = make_drive()
-    question = loop_question(drive.sparse_map, drive.sensor, drive.loop)
+    question = question_of(drive)
     return drive, question, adjust_loop(question, CONFIG)
 
 
@@ -162,7 +166,7 @@ def test_one_keyframe_sees_a_point_that_was_two_only_once(asked) -> None:
 def test_the_map_follows_the_answer_with_what_came_since() -> None:
     drive = make_drive(1)
     sparse_map = drive.sparse_map
-    answer = adjust_loop(loop_question(sparse_map, drive.sensor, drive.loop), CONFIG)
+    answer = adjust_loop(question_of(drive), CONFIG)
     positions_m = sparse_map.position_m.copy()
     last = sparse_map.keyframes[-1]
     later = replace(
@@ -233,7 +237,7 @@ def test_the_full_adjustment_follows_the_pose_graph_and_later_loops_wait(monkeyp
     assert back_end.n_loops == 1
     due = [back_end.take() for _ in range(30)]
     assert sum(c is not None for c in due) == 1 and due[2] is None
-    assert (back_end.n_full, back_end.is_busy) == (1, False)
+    assert back_end.n_full == 1 and not back_end.is_busy(drive.sparse_map)
 
 
 def test_after_the_end_all_that_is_under_way_is_settled(monkeypatch) -> None:
@@ -241,13 +245,34 @@ def test_after_the_end_all_that_is_under_way_is_settled(monkeypatch) -> None:
     back_end, worker = looping_back_end(drive, monkeypatch)
     back_end.after_keyframe(drive.sparse_map, Features.empty())
     told = []
-    while back_end.is_busy and len(told) < 5:
+    while back_end.is_busy(drive.sparse_map) and len(told) < 5:
         if back_end._question is None:
             monkeypatch.setattr(worker, "submit", lambda f, *a: _done(f(*a)))
         else:
             told.append(worker.answer())
         correct_map(drive.sparse_map, back_end.settle(drive.sparse_map))
     assert told == ["solve_pose_graph"] and back_end.n_full == 1
+
+
+def test_a_settled_map_is_settled_again_when_it_has_grown(monkeypatch) -> None:
+    drive = make_drive(2)
+    sparse_map = drive.sparse_map
+    back_end, worker = looping_back_end(drive, monkeypatch, local_adjustment=False)
+    monkeypatch.setattr(worker, "submit", lambda f, *a: _done(f(*a)))
+    back_end.after_keyframe(sparse_map, Features.empty())
+    while back_end.is_busy(sparse_map):
+        correct_map(sparse_map, back_end.settle(sparse_map))
+    monkeypatch.setattr(back_end._loops, "take", lambda sparse_map, features: None)
+    asked_at = []
+    for n in range(N + 1, N + 11):
+        last = sparse_map.keyframes[-1]
+        sparse_map.add_keyframe(replace(last, frame_index=last.frame_index + 1))
+        assert back_end.is_busy(sparse_map)  # after the end nothing would be left out
+        back_end.after_keyframe(sparse_map, Features.empty())
+        if back_end._question is not None:
+            asked_at.append(n)
+            break
+    assert asked_at == [int(np.ceil(1.2 * N))]
 
 
 def _done(result) -> Future:
@@ -262,4 +287,4 @@ def test_without_full_adjustment_the_pose_graph_is_all(monkeypatch) -> None:
     back_end.after_keyframe(drive.sparse_map, Features.empty())
     worker.answer()
     assert sum(back_end.take() is not None for _ in range(10)) == 1
-    assert not back_end.is_busy
+    assert not back_end.is_busy(drive.sparse_map)
