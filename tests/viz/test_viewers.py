@@ -114,7 +114,7 @@ class Follower:
 
 
 def test_frames_that_were_shown_follow_the_back_end(street, tmp_path):
-    adjusting = ["backend.local_adjustment=true", "backend.process=false"]
+    adjusting = ["backend.local_from_keyframe=0", "backend.process=false"]
     settings = ["batch.at_end=false", "mapping.keyframe_max_interval=2", *adjusting]
     follower = Follower()
     assert isinstance(follower, KeyframeSink)
