@@ -175,6 +175,7 @@ class _Work:
                 self._process_left(ctrl_c)
                 progress.in_frame = True  # what is half settled is no place to go on from
                 self.slam.settle()
+                self._tell_moves()
                 progress.in_frame = False
         except KeyboardInterrupt:
             _note_interruption(progress)
@@ -225,14 +226,18 @@ class _Work:
         progress.n_done += 1
         progress.last, progress.in_frame = prepared.frame, False
         _log_frame(result)
-        moved = self.slam.n_corrections > progress.n_corrections
-        progress.n_corrections = self.slam.n_corrections
-        for sink in self.sinks:
-            if moved and isinstance(sink, KeyframeSink):
-                sink.keyframes(*self.slam.keyframe_poses())
+        self._tell_moves()
         for sink in self.sinks:
             sink.frame(prepared.frame, result)
         return end
+
+    def _tell_moves(self) -> None:
+        """Tell the sinks that wish to know where keyframes are, if any has moved."""
+        moved = self.slam.n_corrections > self.progress.n_corrections
+        self.progress.n_corrections = self.slam.n_corrections
+        for sink in self.sinks:
+            if moved and isinstance(sink, KeyframeSink):
+                sink.keyframes(*self.slam.keyframe_poses())
 
     def _keep(self) -> None:
         """A checkpoint; what the sinks were told before it is done then."""

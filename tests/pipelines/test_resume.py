@@ -236,7 +236,7 @@ def test_a_loop_that_is_being_closed_is_closed_and_settled_alike(street) -> None
         np.testing.assert_array_equal(one.objects.centers_m, other.objects.centers_m)
     assert ours._backend.n_applied == theirs._backend.n_applied == 1
     np.testing.assert_array_equal(ours.static_map().points_m, theirs.static_map().points_m)
-    ours._backend._settle_loop(ours.map, loop)
+    ours._backend._settle_loop(ours.map, loop.keyframe, loop.place)
     theirs = through_arrays(ours)
     one, other = (slam._backend._judge(slam._backend._question) for slam in (ours, theirs))
     assert ours._backend.n_full == theirs._backend.n_full
