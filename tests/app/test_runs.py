@@ -61,7 +61,8 @@ def test_flags_reach_the_run(calls) -> None:
     line = "run data --dataset vdo --sequence a --start 2 --frames 5 --stride 3 --output out"
     assert runs.run(words(f"{line} --set orb.n_features=900")) == 0
     assert calls["opened"] == ("data", "vdo", "a", {})
-    assert calls["span"] == {"start": 2, "frames": 5, "stride": 3}
+    expected = {"start": 2, "frames": 5, "stride": 3, "checkpoint_every": 50, "resume": False}
+    assert calls["span"] == expected
     assert calls["lasting_map"] == LastingMap()
     assert calls["output"] == "out"
     assert calls["config"].orb.n_features == 900
