@@ -20,13 +20,15 @@ CHECKS = {
     "ruff format": ["ruff", "format", "--check", "."],
     "mypy": ["mypy"],
 }
+# A file's tests share what its first one makes, so they stay together.
+ALL_TESTS = ["-n", "auto", "--maxprocesses", "4", "--dist", "loadfile"]
 
 
 def test(arguments: Namespace) -> int:
     """All checks, even after one failed; 0 when all passed. pytest comes last."""
     started = time.monotonic()
     _bring_browser()
-    checks = {**CHECKS, "pytest": ["pytest", *arguments.pytest_arguments]}
+    checks = {**CHECKS, "pytest": ["pytest", *(arguments.pytest_arguments or ALL_TESTS)]}
     failed = [name for name, command in checks.items() if not _passes(name, command)]
     verdict = f"FAILED: {', '.join(failed)}" if failed else "all checks passed"
     print(f"dyob-slam: {verdict} in {time.monotonic() - started:.0f} s", flush=True)

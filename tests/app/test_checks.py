@@ -45,6 +45,12 @@ def test_one_failure_fails_the_whole_and_stops_nothing(commands, capsys, module)
     assert module in closing
 
 
+def test_the_whole_suite_uses_all_cores(commands) -> None:
+    seen, _ = commands
+    assert checks.test(Namespace(pytest_arguments=[])) == 0
+    assert seen[-1] == ["pytest", *checks.ALL_TESTS]
+
+
 def test_the_browser_is_installed_where_it_is_missing(commands, monkeypatch, capsys) -> None:
     installed: list[str] = []
     monkeypatch.delenv("DYOB_NO_SETUP", raising=False)
