@@ -19,22 +19,29 @@ from numpy.typing import NDArray
 
 from pipelines.backend.back_end import BackEnd
 from pipelines.backend.seen_places import SeenPlaces
+from pipelines.camera_tracking import CameraTracking
 from pipelines.config import Config
 from pipelines.depth import StereoDepth
 from pipelines.detection.geometry import MultiViewGeometry
 from pipelines.detection.geometry_view import GeometryView
-from pipelines.errors import FrameError
 from pipelines.frame_observations import FrameObservations, Sightings
 from pipelines.frontend.orb import OrbExtractor
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame, Tracker
-from pipelines.frontend.view import PreparedFrame, View, complete_view, prepare_frame
+from pipelines.frontend.view import (
+    PreparedFrame,
+    View,
+    check_size,
+    complete_view,
+    prepare_frame,
+)
 from pipelines.mapping.correction import FrameAnchors, MapCorrection, correct_map
 from pipelines.mapping.local_mapping import LocalMapping
 from pipelines.mapping.sightings import static_sightings
 from pipelines.mapping.sparse_map import SparseMap
 from pipelines.object_types import ObjectEstimates
 from pipelines.objects.frame import ObjectFrame
+from pipelines.objects.landmarks import StandingObjects
 from pipelines.objects.tracking import ObjectTracker
 from pipelines.observations import Tracks
 from pipelines.perception import FILES, DenseFlow, Segmentation
@@ -42,7 +49,6 @@ from pipelines.types import (
     Array,
     Frame,
     FrameResult,
-    MotionHypothesis,
     StaticMap,
     StereoCamera,
     TrackingStatus,
@@ -88,7 +94,6 @@ class DyObSlam:
         if known_map is not None and not localize:
             known_map.detach_offset()
         self.localize = localize
-        self._knows_the_world = known_map is not None  # which then has its origin elsewhere
         self.places = SeenPlaces(self.config.places)
         self.places.add_map(self.map)
         self._orb = OrbExtractor(self.config.orb)
@@ -96,14 +101,17 @@ class DyObSlam:
         self.sensor = Sensor(camera, self.config.depth)
         self._tracker = Tracker(self.sensor, self.config.tracking, self.places.alike)
         self._mapping = LocalMapping(self.sensor, self.config.mapping, self.config.orb)
+        # The world of a known map has its origin elsewhere
+        self._camera_tracking = CameraTracking(
+            self._tracker, self._mapping, knows_the_world=known_map is not None, localize=localize
+        )
         self._segmentation = Segmentation(self.config.detector)
         self._flow = DenseFlow(self.config.flow)
         self._objects = ObjectTracker(self.sensor, self.config.objects, self.config.tracking.seed)
         self._geometry = MultiViewGeometry(camera, self.config.geometry)
         self._backend = BackEnd(self.sensor, self.config.backend, self.places)
         self._anchors = FrameAnchors()
-        self._landmarks: set[int] = set()
-        self._lost_frames = 0
+        self._standing = StandingObjects(self.config.objects, self.config.orb.mask_dilation_px)
         self._static_tracks = Tracks.empty()  # of the last frame
         self._timings_ms: dict[str, float] = {}
         self._perception = (self._segmentation.__getstate__(), self._flow.__getstate__())
@@ -126,9 +134,9 @@ class DyObSlam:
         # 7. Which detection is which object; masks that are missed are carried on
         with self._stage("objects"):
             objects = self._objects.associate(view, prepared.detections, self._predict(view))
-            view = view.masked(self._labels_that_move(objects, view), self._dilation_px)
+            view = self._hide_what_may_move(view, objects)
         # 4. Camera pose
-        tracked = self._track(view)
+        tracked = self._camera_tracking.track(view, self.map, self._stage)
         # Across a jump no motion can be told, of objects neither: as after a LOST frame
         covariance = np.full((6, 6), np.nan) if tracked.is_jump else tracked.covariance
         # 6. Multi-view geometry repairs masks, and finds what no detector knows
@@ -159,7 +167,7 @@ class DyObSlam:
         answers are the same. Raises FrameError for an image that is not of the camera's size,
         ModelError where a network's file is missing or damaged.
         """
-        _check_size(self.camera, frame)
+        check_size(self.camera, frame)
         spent: dict[str, float] = {}
         # 0. Depth, given or by stereo
         with timed(spent, "depth"):
@@ -261,83 +269,14 @@ class DyObSlam:
             self._stereo = StereoDepth(self.config.depth, self.camera)
         return self._stereo.compute(frame.image, frame.image_right)
 
-    def _track(self, view: View) -> TrackedFrame:
-        if self._tracker.motion is None and not self._knows_the_world:
-            return self._start(view, np.eye(4))
-        motion = self._tracker.motion or self._tracker.start(view, np.eye(4))
-        tracked = self._tracker.track(view, self.map, self._stage)
-        if tracked.status is TrackingStatus.OK:
-            motion.update(
-                tracked.T_world_camera,
-                view.timestamp_s,
-                continuous=self._lost_frames == 0 and not tracked.is_jump,
-            )
-            self._lost_frames = 0
-            return tracked
-        self._tracker.forget_flow()
-        if len(self._mapping.mappable_features(view, Tracks.empty())):
-            self._lost_frames += 1
-        if self._lost_frames >= self.config.tracking.restart_after_frames:
-            if self._may_start_anew:
-                return self._start(view, tracked.T_world_camera)
-            if self._lost_frames == self.config.tracking.restart_after_frames:
-                _log.warning(
-                    "frame %d: the place is not recognised in the loaded map after %d frames; "
-                    "frames stay LOST until one is",
-                    view.frame_index,
-                    self._lost_frames,
-                )
-        return tracked
-
-    @property
-    def _may_start_anew(self) -> bool:
-        """Whether a new piece of map may begin where the motion led.
-
-        Not before a loaded map was recognised: nothing would tie the piece to that map's world.
-        """
-        return not self.localize and (self._tracker.remembers or not self._knows_the_world)
-
-    def _start(self, view: View, T_world_camera: Array) -> TrackedFrame:
-        """First frame, or a new start at the predicted pose after a lost stretch.
-
-        LOST while too few features have a depth: the next frame tries again.
-        """
-        n_points = len(self._mapping.mappable_features(view, Tracks.empty()))
-        enough = n_points >= self.config.tracking.min_inliers
-        if enough:
-            self._tracker.start(view, T_world_camera)
-            self._lost_frames = 0
-        return TrackedFrame(
-            TrackingStatus.OK if enough else TrackingStatus.LOST,
-            MotionHypothesis.FIRST_FRAME if enough else MotionHypothesis.NONE,
-            T_world_camera,
-            np.zeros((6, 6)) if enough else np.full((6, 6), np.nan),
-            Tracks.empty(),
-            np.zeros(0, bool),
-            np.nan,
-            np.empty(0, np.int64),
-        )
-
     def _predict(self, view: View) -> Array:
         """T_world_camera (4, 4) as expected for a view."""
         motion = self._tracker.motion
         return np.eye(4) if motion is None else motion.predict(view.timestamp_s)
 
-    @property
-    def _dilation_px(self) -> int:
-        return self.config.orb.mask_dilation_px
-
-    def _labels_that_move(self, objects: ObjectFrame, view: View) -> NDArray[np.int32]:
-        """(H, W) pixels that the camera must not rely on: objects, but for what stands still.
-
-        What has stood still may drive off at any time, so it serves only where it is needed.
-        """
-        column, row = np.rint(view.features.uv_px).astype(np.int64).T
-        off_objects = np.mean(objects.labels[row, column] == 0) if len(row) else 1.0
-        if off_objects >= self.config.objects.landmarks_below:
-            return objects.labels
-        landmarks = self._objects.landmark_ids(view.timestamp_s)
-        return np.where(np.isin(objects.labels, landmarks), 0, objects.labels).astype(np.int32)
+    def _hide_what_may_move(self, view: View, objects: ObjectFrame) -> View:
+        standing = self._objects.landmark_ids(view.timestamp_s)
+        return self._standing.hide_others(view, objects.labels, standing)
 
     @property
     def _uses_geometry(self) -> bool:
@@ -366,7 +305,7 @@ class DyObSlam:
         found = self._geometry.segment(seen, objects.detections(self._objects.class_names()))
         names = self._objects.revise(view, objects, found, tracked.T_world_camera)
         self._geometry.rename(names)
-        return view.masked(self._labels_that_move(objects, view), self._dilation_px)
+        return self._hide_what_may_move(view, objects)
 
     def _forget_landmarks(
         self, view: View, tracked: TrackedFrame, objects: ObjectFrame
@@ -375,26 +314,13 @@ class DyObSlam:
 
         What is left of the view and its tracks, so that nothing on them is mapped again.
         """
-        before, self._landmarks = (
-            self._landmarks,
-            set(self._objects.landmark_ids(view.timestamp_s)),
-        )
-        gone = [i for i in before - self._landmarks if i in objects.windows]
+        gone = self._standing.driven_off(self._objects.landmark_ids(view.timestamp_s))
+        gone &= set(objects.windows)
         if not gone or self.localize or tracked.status is not TrackingStatus.OK:
             return view, tracked
-        # Widened: the points lie where the thing stood until now
-        left_by = np.where(np.isin(objects.labels, gone), objects.labels, 0).astype(np.int32)
-        without = view.masked(left_by, self._dilation_px)
-        ids, uv = self.map.local_points(tracked.T_world_camera, tracked.tracks.point_ids)
-        ids = np.concatenate([ids, tracked.tracks.point_ids])
-        self.map.remove_points(ids[~without.is_static(np.vstack([uv, tracked.tracks.uv_px]))])
-        alive = self.map.alive[tracked.tracks.point_ids]
-        return view.masked(self._labels_that_move(objects, view), self._dilation_px), replace(
-            tracked,
-            tracks=tracked.tracks[alive],
-            inliers=tracked.inliers[alive],
-            visible_ids=tracked.visible_ids[self.map.alive[tracked.visible_ids]],
-        )
+        left_by = np.where(np.isin(objects.labels, list(gone)), objects.labels, 0)
+        left = self._standing.forget_points(self.map, view, tracked, left_by.astype(np.int32))
+        return self._hide_what_may_move(view, objects), left
 
     def _grow_map(self, view: View, tracked: TrackedFrame) -> bool:
         """Whether the frame became a keyframe; LOST ones leave the map alone."""
@@ -462,12 +388,3 @@ def timed(spent_ms: dict[str, float], name: str) -> Iterator[None]:
         yield
     finally:
         spent_ms[name] = spent_ms.get(name, 0.0) + 1e3 * (time.perf_counter() - begin)
-
-
-def _check_size(camera: StereoCamera, frame: Frame) -> None:
-    height, width = frame.image.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        raise FrameError(
-            f"expected an image of {camera.width} x {camera.height}, found {width} x {height}; "
-            "all images of a sequence must have the calibrated size"
-        )

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.depth import to_gray
+from pipelines.errors import FrameError
 from pipelines.frontend.orb import OrbExtractor
 from pipelines.frontend.sampling import sample_disparity
 from pipelines.object_types import Detections
@@ -121,6 +122,16 @@ class PreparedFrame:
     flow_is_given: bool = False
     timings_ms: dict[str, float] = field(default_factory=dict)
     perception: tuple[Any, ...] = ()
+
+
+def check_size(camera: StereoCamera, frame: Frame) -> None:
+    """Raise FrameError unless a frame's image has its camera's size."""
+    height, width = frame.image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise FrameError(
+            f"expected an image of {camera.width} x {camera.height}, found {width} x {height}; "
+            "all images of a sequence must have the calibrated size"
+        )
 
 
 def prepare_frame(

@@ -1,8 +1,8 @@
 """The browser viewer of a run that goes on: a sink with a thread of its own.
 
-Owns what is shown of a frame, and what is left out when the view lags behind: pictures, never
-frames, and nothing of the run. The run hands each frame over and goes on at once. Pictures are
-drawn in a process of their own, as Python runs one thread at a time.
+Owns what is shown of a frame, and what is left out: pictures that come faster than one looks, or
+than they are drawn, never frames, and nothing of the run. The run hands each frame over and goes on
+at once. Pictures are drawn in a process of their own, as Python runs one thread at a time.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.backend.worker import ProcessWorker, WorkerDied
+from pipelines.backend.worker import ProcessWorker
 from pipelines.types import Array, Frame, FrameResult
 from viz.browser.cloud import build_cloud
 from viz.browser.live_map import LiveFrame, LiveFrames, LiveMap
@@ -32,6 +32,7 @@ from viz.overlay import draw_frame
 
 WAITING = 4  # frames that wait with their images
 MAP_EVERY_S = 1.0
+PICTURE_EVERY_S = 0.25  # to draw each one would take the run half a core
 NICE = 10  # what the process of the pictures lets go before it
 MAX_LIVE_POINTS = 60_000  # as the map is sent anew each time
 # Up and forward of the first camera, whose axes the world has.
@@ -55,6 +56,23 @@ class _Moved:
     Ts_world_camera: Array
 
 
+@dataclass(frozen=True, slots=True)
+class _Drawn:
+    """The picture of a frame; None where the process that drew it has died."""
+
+    position: int
+    jpeg: bytes | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Sketch:
+    """What the picture of a frame is drawn from."""
+
+    position: int
+    frame: Frame
+    result: FrameResult
+
+
 class LiveViewer:
     """A sink that shows a run in the browser while it goes on; see `server.PageServer`.
 
@@ -69,7 +87,8 @@ class LiveViewer:
     ) -> None:
         self.host, self.port, self.announce = host, port, announce
         self.n_left_out = 0  # pictures
-        self._waiting: deque[_Seen | _Moved | None] = deque()
+        self._waiting: deque[_Seen | _Moved | _Drawn] = deque()
+        self._is_over = False
         self._has_come = threading.Condition()
         self._thread: threading.Thread | None = None
 
@@ -81,6 +100,8 @@ class LiveViewer:
         self._frames = LiveFrames()
         self._map = LiveMap(config.mapping.min_observations)
         self._have_moved, self._map_due_s = False, 0.0
+        self._sketch: _Sketch | None = None  # the newest that is not drawn yet
+        self._is_drawing, self._picture_due_s = False, 0.0
         self._painter = ProcessWorker()
         self._painter.submit(os.nice, NICE)
         self._server.start()
@@ -107,7 +128,7 @@ class LiveViewer:
         if self._thread is None:
             return
         with self._has_come:
-            self._waiting.append(None)
+            self._is_over = True
             self._has_come.notify()
         self._thread.join()
         self._thread = None
@@ -124,34 +145,73 @@ class LiveViewer:
     # ---- in the viewer's thread
 
     def _show_all(self) -> None:
-        while (item := self._next()) is not None:
+        while (items := self._take()) is not None:
             try:
-                if isinstance(item, _Moved):
-                    self._have_moved |= self._frames.follow(item.frame_index, item.Ts_world_camera)
-                else:
-                    self._show(item.frame, item.result)
+                for item in items:
+                    self._show(item)
+                if self._draws_in_s == 0:
+                    self._draw()
                 if time.monotonic() >= self._map_due_s:
                     self._show_map()
             except Exception:  # whatever goes wrong in the view, the run goes on
                 logger.exception("the browser viewer has missed something")
         self._show_map()
 
-    def _next(self) -> _Seen | _Moved | None:
+    def _take(self) -> list[_Seen | _Moved | _Drawn] | None:
+        """What has come, nothing where a picture is due before that; None when all is shown."""
         with self._has_come:
-            self._has_come.wait_for(lambda: self._waiting)
-            return self._waiting.popleft()
+            self._has_come.wait_for(self._has_news, self._draws_in_s)
+            items = list(self._waiting)
+            self._waiting.clear()
+            is_end = self._is_over and not (items or self._is_drawing or self._sketch)
+            return None if is_end else items
 
-    def _show(self, frame: Frame | None, result: FrameResult) -> None:
+    def _has_news(self) -> bool:
+        return bool(self._waiting) or (self._is_over and not self._is_drawing)
+
+    @property
+    def _draws_in_s(self) -> float | None:
+        """How long until the next picture is drawn; None where none is to be."""
+        if self._sketch is None or self._is_drawing:
+            return None
+        return 0.0 if self._is_over else max(self._picture_due_s - time.monotonic(), 0.0)
+
+    def _show(self, item: _Seen | _Moved | _Drawn) -> None:
+        if isinstance(item, _Moved):
+            self._have_moved |= self._frames.follow(item.frame_index, item.Ts_world_camera)
+        elif isinstance(item, _Drawn):
+            self._is_drawing = False
+            if item.jpeg is not None:
+                self._server.tell_picture(item.position, item.jpeg)
+        else:
+            self._show_frame(item.frame, item.result)
+
+    def _show_frame(self, frame: Frame | None, result: FrameResult) -> None:
         now = self._frames.add(result)
-        k = len(self._frames.list) - 1
         self._server.tell_frame(_record(now))
         if frame is None:
             return
         if result.observations is not None:
             self._map.add(result.observations, self._frames, frame.image)
-        bare = replace(result, observations=None)
-        with suppress(WorkerDied):  # it is started anew for the next one
-            self._server.tell_picture(k, self._painter.submit(draw_jpeg, frame, bare).result())
+        self.n_left_out += self._sketch is not None
+        position = len(self._frames.list) - 1
+        self._sketch = _Sketch(position, frame, replace(result, observations=None))
+
+    def _draw(self) -> None:
+        """Begin with the picture of the newest frame."""
+        assert self._sketch is not None
+        sketch, self._sketch = self._sketch, None
+        self._picture_due_s = time.monotonic() + PICTURE_EVERY_S
+
+        def take(drawing: Future[bytes]) -> None:
+            jpeg = None if drawing.exception() else drawing.result()
+            with self._has_come:
+                self._waiting.append(_Drawn(sketch.position, jpeg))
+                self._has_come.notify()
+
+        drawing = self._painter.submit(draw_jpeg, sketch.frame, sketch.result)
+        self._is_drawing = True
+        drawing.add_done_callback(take)
 
     def _show_map(self) -> None:
         if self._have_moved:
