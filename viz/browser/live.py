@@ -31,7 +31,7 @@ from viz.browser.records import frame_record, page_setup
 from viz.overlay import draw_frame
 
 WAITING = 4  # frames that wait with their images
-MAP_EVERY_S = 1.0
+MAP_EVERY_S = 2.0
 PICTURE_EVERY_S = 0.25  # to draw each one would take the run half a core
 NICE = 10  # what the process of the pictures lets go before it
 MAX_LIVE_POINTS = 60_000  # as the map is sent anew each time
