@@ -64,6 +64,7 @@ _CLASSES = {
     "frontend.hypotheses": ("ConstantVelocity",),
     "frontend.measurement": ("LastFrame",),
     "frontend.noise": ("NoiseModel",),
+    "frontend.patches": ("Patches",),
     "frontend.sensor": ("Sensor",),
     "frontend.tracking": ("Tracker",),
     "frontend.view": ("View",),

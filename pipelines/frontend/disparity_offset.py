@@ -4,6 +4,9 @@ A tenth of a pixel of disparity error makes far points half a percent too far an
 camera as much too long. Near and far points then disagree about the camera's motion, which makes
 the error observable. Owns that estimate; the map keeps how each point depends on it.
 
+A rig is calibrated on targets close by, where its focal length and baseline make up for such an
+error. So the error is one of far disparities, and is gone at the targets' distance.
+
 Deviation: the paper trusts the calibration.
 """
 
@@ -23,6 +26,7 @@ from pipelines.geometry import (
 from pipelines.observations import StereoObservations
 from pipelines.types import Array, StereoCamera
 
+_TARGET_BASELINES = 10.0  # distance of calibration targets, in baselines
 _PRIOR_SIGMA_PX = 0.25  # rectified pairs are off by about as much
 _INDEPENDENT_SHARE = 0.05  # errors of the same points in consecutive frames are alike
 _SIGNIFICANT_SIGMAS = 1.0  # a smaller offset is not told from none
@@ -30,8 +34,16 @@ _SIGNIFICANT_PX = 0.1  # nor is a smaller one told from the bias of computed flo
 _FORGET = 0.99  # share of the evidence that each frame keeps
 
 
+def offset_share(camera: StereoCamera, disparity_px: Array) -> Array:
+    """How much of the offset each disparity has: all far away, none at calibration targets.
+
+    disparity_px: of any shape, as is the answer.
+    """
+    return 1.0 - np.float32(_TARGET_BASELINES / camera.fx) * disparity_px
+
+
 class DisparityOffset:
-    """Running least-squares estimate of the offset b in true disparity = measured + b."""
+    """Running least-squares estimate of the offset b: true = measured + b * `offset_share`."""
 
     def __init__(self) -> None:
         self.offset_px = 0.0
@@ -61,7 +73,7 @@ class DisparityOffset:
         W = whitening(observation_covariance(camera, T_world_camera, observations))
         residual = observations.uvr_px - project_stereo(camera, points)
         slope = -(D @ (offset_slopes @ R)[..., None])[..., 0]  # d residual / d offset
-        slope[:, 2] -= 1.0
+        slope[:, 2] -= offset_share(camera, camera.bf / points[:, 2])
         mono = np.isnan(residual[:, 2])
         residual[mono, 2] = 0.0
         W[mono, 2] = 0.0  # the first two rows do not know of the third

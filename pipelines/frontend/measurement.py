@@ -5,7 +5,7 @@ Owns the search for points by flow, by ORB descriptors and by patch alignment. E
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +14,17 @@ from scipy.spatial import cKDTree
 from pipelines.config import TrackingConfig
 from pipelines.frontend.alignment import align_patches, fuse_measurements
 from pipelines.frontend.matching import match_in_radius
+from pipelines.frontend.patches import Patches
 from pipelines.frontend.sampling import sample_bilinear
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
 from pipelines.geometry import MIN_DEPTH_M, invert_T, project_stereo, transform_points
 from pipelines.mapping.sparse_map import SparseMap
 from pipelines.observations import Tracks
-from pipelines.types import Array
+from pipelines.types import Array, StereoCamera
 
 _ALIGNMENT_TOLERANCE_PX = 10.0  # alignment may move a point this far from an ORB match
+_DRIFT_PX = 2.0  # a place this far from where the start, or the last frame, has it is another one
 _TAKEN_PX = 3.0  # a feature this near a tracked point is that point
 _NEIGHBOURS = 5  # matched points that predict the place of an unmatched one
 
@@ -32,12 +34,13 @@ class LastFrame:
     """What the next frame is tracked from.
 
     view: the last one that was tracked. tracks: the points seen in it. flow_starts_here: whether
-    the next frame's flow begins at it.
+    the next frame's flow begins at it. patches: how the tracks' points looked at first.
     """
 
     view: View
     tracks: Tracks
     flow_starts_here: bool = True
+    patches: Patches = field(default_factory=Patches.empty)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,17 +65,15 @@ def measure_points(
     """Where the points of the last frame are in this view.
 
     The start is the given flow where there is one, else ORB matches around the places that the
-    predicted `T_world_camera` (4, 4) says. Patch alignment makes it sub-pixel, and is fused with
-    the flow by their learned noise.
+    predicted `T_world_camera` (4, 4) says. Alignment to each point's first sight makes it
+    sub-pixel, and is fused with the flow by their learned noise.
     """
     flow_uv = _places_by_flow(last, view)
     start = _places_to_start(last, view, sparse_map, T_world_camera, flow_uv, config)
     by_flow = np.asarray(np.isfinite(flow_uv).all(axis=1))
     tolerance = config.flow_tolerance_px if by_flow.any() else _ALIGNMENT_TOLERANCE_PX
     tracks = last.tracks
-    aligned, ok = align_patches(
-        last.view.gray, view.gray, tracks.uv_px, start, tolerance, sure=by_flow
-    )
+    aligned, ok = _align(last, view, start, by_flow, T_world_camera, sensor.camera, tolerance)
     sigma = sensor.noise.sigma_uv_px
     uv, valid, sigma_px = fuse_measurements(
         flow_uv, by_flow, sigma["flow"], aligned, ok, sigma["alignment"]
@@ -84,6 +85,39 @@ def measure_points(
         Tracks(tracks.point_ids[valid], uv, sensor.read_close_disparity(view, uv), sigma_px[valid]),
         {"flow": flow_uv[valid], "alignment": aligned[valid]},
     )
+
+
+def _align(
+    last: LastFrame,
+    view: View,
+    start: Array,
+    by_flow: NDArray[np.bool_],
+    T_world_camera: Array,
+    camera: StereoCamera,
+    tolerance_px: float,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Places (N, 2) by the looks of the points when they were first seen, and which are valid.
+
+    Where flow does not say to a pixel or two where to begin, or there is no such picture, they are
+    aligned to the last frame before, or instead.
+    """
+    uv, rows = start.copy(), last.patches.rows(last.tracks.point_ids)
+    ok = np.zeros(len(rows), bool)
+    other = np.flatnonzero(~by_flow | (rows < 0))
+    if len(other):
+        uv_from = last.tracks.uv_px[other]
+        placed, ok[other] = align_patches(
+            last.view.gray, view.gray, uv_from, start[other], tolerance_px, by_flow[other]
+        )
+        uv[other[ok[other]]] = placed[ok[other]]
+    which = np.flatnonzero((rows >= 0) & np.isfinite(uv).all(axis=1))
+    Hs = last.patches.homographies(camera, rows[which], T_world_camera)
+    for part, sheet, places in last.patches.sheets(rows[which], Hs, view.gray.shape):
+        own = which[part]
+        sure = np.ones(len(own), bool)
+        placed, found = align_patches(sheet, view.gray, places, uv[own], _DRIFT_PX, sure)
+        uv[own[found]], ok[own[found]] = placed[found], True
+    return uv, ok
 
 
 def _places_by_flow(last: LastFrame, view: View) -> Array:

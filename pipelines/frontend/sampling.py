@@ -52,32 +52,56 @@ def sample_disparity(disparity_px: NDArray[np.float32], uv_px: Array, sigma_px: 
     """
     if len(uv_px) == 0:
         return np.empty(0)
+    return _fit_planes(disparity_px, uv_px, sigma_px, 1)[:, 0]
+
+
+def disparity_slopes(disparity_px: NDArray[np.float32], uv_px: Array, sigma_px: float) -> Array:
+    """Slopes (N, 2) of the disparity along u and v at places (N, 2), in px a px.
+
+    As `sample_disparity`, from every second pixel of 9 x 9; none, 0, where too few remain.
+    """
+    if len(uv_px) == 0:
+        return np.empty((0, 2))
+    return np.nan_to_num(_fit_planes(disparity_px, uv_px, sigma_px, 2)[:, 1:])
+
+
+def _fit_planes(
+    disparity_px: NDArray[np.float32], uv_px: Array, sigma_px: float, spread: int
+) -> Array:
+    """(N, 3) disparity and its slopes at places (N, 2), NaN where too few pixels lie on a plane.
+
+    spread: px, from one to the next of the 5 x 5 pixels.
+    """
     H, W = disparity_px.shape
-    x0 = np.clip(np.rint(uv_px[:, 0]).astype(np.int64), _HALF, W - 1 - _HALF)
-    y0 = np.clip(np.rint(uv_px[:, 1]).astype(np.int64), _HALF, H - 1 - _HALF)
-    pixels = (y0 * W + x0)[:, None] + (_DY * W + _DX)
+    reach = _HALF * spread
+    x0 = np.clip(np.rint(uv_px[:, 0]).astype(np.int64), reach, W - 1 - reach)
+    y0 = np.clip(np.rint(uv_px[:, 1]).astype(np.int64), reach, H - 1 - reach)
+    pixels = (y0 * W + x0)[:, None] + spread * (_DY * W + _DX)
     window = np.take(disparity_px.ravel(), pixels)
     centre = np.sort(np.take(window, _INNER, axis=1), axis=1)  # NaN sorts last
     n_valid = np.isfinite(centre).sum(1)
     median = centre[np.arange(len(centre)), np.maximum(n_valid - 1, 0) // 2].astype(np.float64)
     window = window.astype(np.float64)
-    edge = _EDGE_SHARE * median + _EDGE_SIGMAS * sigma_px
+    edge = spread * _EDGE_SHARE * median + _EDGE_SIGMAS * sigma_px
     window -= median[:, None]
     on_plane = np.abs(window) < edge[:, None]
-    offset = _plane_at(
+    plane = _planes_at(
         np.where(on_plane, window, 0.0),
         on_plane.astype(np.float64),
-        uv_px[:, 0] - x0,
-        uv_px[:, 1] - y0,
+        (uv_px[:, 0] - x0) / spread,
+        (uv_px[:, 1] - y0) / spread,
     )
-    supported = on_plane.sum(1) >= _MIN_SUPPORT * len(_DX)
-    return np.where(supported, median + offset, np.nan)
+    plane[:, 0] += median
+    plane[:, 1:] /= spread
+    plane[on_plane.sum(1) < _MIN_SUPPORT * len(_DX)] = np.nan
+    return plane
 
 
-def _plane_at(value: Array, weight: Array, du: Array, dv: Array) -> Array:
-    """Least-squares planes through windows (N, 25) with weights (N, 25), at (du, dv) off centre.
+def _planes_at(value: Array, weight: Array, du: Array, dv: Array) -> Array:
+    """Least-squares planes through windows (N, 25) with weights (N, 25): (N, 3).
 
-    The normal equations of d = c0 + c1 du + c2 dv are solved by Cramer's rule, as there are many.
+    Value at (du, dv) off centre, and slopes. The normal equations of d = c0 + c1 du + c2 dv are
+    solved by Cramer's rule, as there are many.
     """
     n, x, y, xx, yy, xy = (weight @ _MOMENTS).T
     d, dx, dy = (value @ _MOMENTS[:, :3]).T
@@ -88,4 +112,4 @@ def _plane_at(value: Array, weight: Array, du: Array, dv: Array) -> Array:
     c0 = a * d + b * dx + c * dy
     c1 = b * d + e * dx + f * dy
     c2 = c * d + f * dx + g * dy
-    return (c0 + c1 * du + c2 * dv) / determinant
+    return np.column_stack([c0 + c1 * du + c2 * dv, c1, c2]) / determinant[:, None]

@@ -28,6 +28,7 @@ from pipelines.frontend.measurement import (
     search_local_map,
 )
 from pipelines.frontend.motion_only_ba import PoseEstimate, estimate_camera_pose
+from pipelines.frontend.patches import Patches, renew_patches
 from pipelines.frontend.rgbd_odometry import estimate_rgbd_odometry
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
@@ -107,9 +108,22 @@ class Tracker:
         self.motion = ConstantVelocity(T_world_camera, view.timestamp_s)
         return self.motion
 
-    def remember(self, view: View, tracks: Tracks) -> None:
-        """Keep what the next frame will be tracked from."""
-        self._last = LastFrame(view, tracks)
+    def remember(self, view: View, T_world_camera: Array, tracks: Tracks, depth_m: Array) -> None:
+        """Keep what the next frame will be tracked from.
+
+        T_world_camera: (4, 4) of the view. depth_m: (N,) of the tracks' points in it.
+        """
+        patches = renew_patches(
+            Patches.empty() if self._last is None else self._last.patches,
+            self.camera,
+            view,
+            T_world_camera,
+            tracks.point_ids,
+            tracks.uv_px,
+            depth_m,
+            self.noise.sigma_disparity_px,
+        )
+        self._last = LastFrame(view, tracks, patches=patches)
 
     def forget_flow(self) -> None:
         """Say that the next frame's flow does not start at the remembered view."""
@@ -120,6 +134,8 @@ class Tracker:
         """Let what is remembered follow a correction of the map: p_new = C (4, 4) @ p_old."""
         if self.motion is not None:
             self.motion.T_world_camera = C @ self.motion.T_world_camera
+        if self._last is not None:
+            self._last = replace(self._last, patches=self._last.patches.moved(C))
 
     def rename_points(self, pairs: NDArray[np.int64]) -> None:
         """Follow the first point of each pair (P, 2) where the second one was followed."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipelines.config import MappingConfig, OrbConfig
-from pipelines.frontend.disparity_offset import follow_camera
+from pipelines.frontend.disparity_offset import follow_camera, offset_share
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.tracking import TrackedFrame
 from pipelines.frontend.view import View
@@ -162,6 +162,7 @@ class LocalMapping:
             sigma_disparity,
         )
         slopes = (T_world_camera[:3, 3] - points) / disparity[:, None]  # as z = bf / d
+        slopes *= offset_share(self.camera, disparity)[:, None]
         colors = read_colors(view, features.uv_px)
         ids = sparse_map.add_points(points, covariances, slopes, features.descriptors, colors)
         return Tracks(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipelines.frontend.disparity_offset import offset_share
 from pipelines.frontend.motion_only_ba import add_pixel_noise, whitening
 from pipelines.geometry import (
     backproject,
@@ -80,7 +81,7 @@ def refine_points(
     residual = observations.uvr_px - project_stereo(camera, points)
     mono = np.isnan(residual[:, 2])
     slope = -np.einsum("nij,nj->ni", J_point, offset_slopes)  # d residual / d offset
-    slope[:, 2] -= 1.0
+    slope[:, 2] -= offset_share(camera, camera.bf / points[:, 2])
     residual[mono, 2] = slope[mono, 2] = 0.0
     if pose_covariance.ndim == 2:
         J_covariance = _each_times(J_pose, pose_covariance)

@@ -1,0 +1,199 @@
+"""Patches: how tracked points looked when they were first seen, and how they should look by now.
+
+A place that is aligned to the last frame carries that frame's error on, so that tracks drift as a
+random walk does; one that is aligned to its first sight does not. Owns the small pictures, and
+their warping to another view of the plane that each shows. Knows no map.
+
+Deviation: in the paper points are matched from frame to frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.frontend.sampling import disparity_slopes
+from pipelines.frontend.view import View
+from pipelines.geometry import invert_T
+from pipelines.types import Array, Image, StereoCamera
+
+SIDE_PX = 21  # the window of the alignment, its gradients, and the fraction of the point's pixel
+_HALF = SIDE_PX // 2
+_MIN_GROWTH, _MAX_GROWTH = 0.85, 2.0  # sizes beyond which a patch is cut anew
+_PIXELS = np.stack(
+    [g.ravel() for g in np.meshgrid(np.arange(SIDE_PX), np.arange(SIDE_PX))] + [np.ones(SIDE_PX**2)]
+).astype(np.float32)  # (3, 441) homogeneous pixels of a patch
+
+
+@dataclass(frozen=True, slots=True)
+class Patches:
+    """Pictures of points (parallel arrays of length N, by ascending id).
+
+    point_ids: (N,). pixels: (N, 21, 21) uint8. corner_px: (N, 2) int64 where the patch began in its
+    image, uv_px: (N, 2) the point's place there. plane: (N, 3) with plane @ (u, v, 1) = 1 / depth
+    about it. T_world_camera: (N, 4, 4) of that image.
+    """
+
+    point_ids: NDArray[np.int64]
+    pixels: Image
+    corner_px: NDArray[np.int64]
+    uv_px: Array
+    plane: Array
+    T_world_camera: Array
+
+    def __len__(self) -> int:
+        return len(self.point_ids)
+
+    @classmethod
+    def empty(cls) -> Patches:
+        """None at all."""
+        return cls(
+            np.empty(0, np.int64),
+            np.empty((0, SIDE_PX, SIDE_PX), np.uint8),
+            np.empty((0, 2), np.int64),
+            np.empty((0, 2)),
+            np.empty((0, 3)),
+            np.empty((0, 4, 4)),
+        )
+
+    def rows(self, point_ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(M,) row of each point's patch, -1 where there is none."""
+        if len(self) == 0:
+            return np.full(len(point_ids), -1)
+        at = np.minimum(np.searchsorted(self.point_ids, point_ids), len(self) - 1)
+        return np.where(self.point_ids[at] == point_ids, at, -1)
+
+    def moved(self, C: Array) -> Patches:
+        """The same in a world that was corrected: p_new = C (4, 4) @ p_old."""
+        return replace(self, T_world_camera=C @ self.T_world_camera)
+
+    def homographies(
+        self, camera: StereoCamera, rows: NDArray[np.int64], T_world_camera: Array
+    ) -> Array:
+        """(M, 3, 3) from pixels of the patches' images to those of a camera at (4, 4)."""
+        K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+        T = invert_T(T_world_camera) @ self.T_world_camera[rows]
+        return K @ (T[:, :3, :3] @ np.linalg.inv(K) + T[:, :3, 3:] @ self.plane[rows, None])
+
+    def sheets(
+        self, rows: NDArray[np.int64], Hs: Array, shape: tuple[int, int]
+    ) -> Iterator[tuple[slice, Image, Array]]:
+        """Images of `shape` (H, W), tiled with patches as they look after homographies Hs.
+
+        rows: (M,), Hs: (M, 3, 3). Yields which of the rows an image holds, the image, and the
+        places (n, 2) of their points in it; more images than one where they do not fit.
+        """
+        across, down = shape[1] // SIDE_PX, shape[0] // SIDE_PX
+        for first in range(0, len(rows), across * down):
+            part = slice(first, first + across * down)
+            tiles = np.zeros((across * down, SIDE_PX, SIDE_PX), np.uint8)
+            n = len(rows[part])
+            tiles[:n] = self._warped(rows[part], Hs[part])
+            grid = tiles.reshape(down, across, SIDE_PX, SIDE_PX).swapaxes(1, 2)
+            sheet = np.zeros(shape, np.uint8)
+            sheet[: down * SIDE_PX, : across * SIDE_PX] = grid.reshape(down * SIDE_PX, -1)
+            row, column = np.divmod(np.arange(n), across)
+            within = self.uv_px[rows[part]] - self.corner_px[rows[part]]
+            yield part, sheet, np.column_stack([column, row]) * SIDE_PX + within
+
+    def _warped(self, rows: NDArray[np.int64], Hs: Array) -> Image:
+        """(n, 21, 21) patches after homographies, with their points where they were."""
+        n, uv = len(rows), self.uv_px[rows]
+        within = uv - self.corner_px[rows]
+        seen_at = np.einsum("nij,nj->ni", Hs, np.column_stack([uv, np.ones(n)]))
+        seen_at = seen_at[:, :2] / seen_at[:, 2:]
+        back = np.linalg.inv(_shift(within - seen_at) @ Hs @ _shift(self.corner_px[rows].astype(float)))
+        source = (back.reshape(-1, 3).astype(np.float32) @ _PIXELS).reshape(n, 3, -1)
+        source[:, :2] /= source[:, 2:]
+        np.clip(source[:, :2], 0, SIDE_PX - 1, out=source[:, :2])
+        source[:, 1] += SIDE_PX * np.arange(n, dtype=np.float32)[:, None]
+        at = np.ascontiguousarray(source[:, :2].swapaxes(0, 1)).reshape(2, -1, SIDE_PX)
+        column = self.pixels[rows].reshape(-1, SIDE_PX)
+        warped = cv2.remap(column, at[0], at[1], cv2.INTER_LINEAR)
+        return warped.reshape(n, SIDE_PX, SIDE_PX)
+
+
+def renew_patches(
+    old: Patches,
+    camera: StereoCamera,
+    view: View,
+    T_world_camera: Array,
+    point_ids: NDArray[np.int64],
+    uv_px: Array,
+    depth_m: Array,
+    sigma_disparity_px: float,
+) -> Patches:
+    """Patches of the points (N,) that are tracked on: the old ones while they fit, else new ones.
+
+    view: in which they are at uv_px (N, 2) and depth_m (N,) away, from T_world_camera (4, 4).
+    """
+    order = np.argsort(point_ids, kind="stable")
+    ids, uv, depth = point_ids[order], uv_px[order], depth_m[order]
+    rows = old.rows(ids)
+    fits = rows >= 0
+    Hs = old.homographies(camera, rows[fits], T_world_camera)
+    growth = _growth(Hs, old.uv_px[rows[fits]])
+    fits[fits] = (growth > _MIN_GROWTH) & (growth < _MAX_GROWTH)
+    new = _cut_patches(
+        camera, view, T_world_camera, ids[~fits], uv[~fits], depth[~fits], sigma_disparity_px
+    )
+    both = np.concatenate([ids[fits], ids[~fits]]).argsort(kind="stable")
+
+    def join(kept: NDArray, fresh: NDArray) -> NDArray:
+        return np.concatenate([kept[rows[fits]], fresh])[both]
+
+    return Patches(
+        ids,
+        join(old.pixels, new.pixels),
+        join(old.corner_px, new.corner_px),
+        join(old.uv_px, new.uv_px),
+        join(old.plane, new.plane),
+        join(old.T_world_camera, new.T_world_camera),
+    )
+
+
+def _cut_patches(
+    camera: StereoCamera,
+    view: View,
+    T_world_camera: Array,
+    point_ids: NDArray[np.int64],
+    uv_px: Array,
+    depth_m: Array,
+    sigma_disparity_px: float,
+) -> Patches:
+    H, W = view.gray.shape
+    corner = np.floor(uv_px).astype(np.int64) - _HALF
+    x = np.clip(corner[:, :1] + np.arange(SIDE_PX), 0, W - 1)
+    y = np.clip(corner[:, 1:] + np.arange(SIDE_PX), 0, H - 1)
+    slopes = disparity_slopes(view.disparity_px, uv_px, sigma_disparity_px)
+    at_origin = camera.bf / depth_m - (slopes * uv_px).sum(axis=1)
+    return Patches(
+        point_ids,
+        view.gray[y[:, :, None], x[:, None, :]],
+        corner,
+        uv_px,
+        np.column_stack([slopes, at_origin]) / camera.bf,
+        np.tile(T_world_camera, (len(uv_px), 1, 1)),
+    )
+
+
+def _growth(Hs: Array, uv_px: Array) -> Array:
+    """(N,) how much larger the surroundings of pixels (N, 2) are after homographies (N, 3, 3).
+
+    0 where they are behind the camera.
+    """
+    w = np.einsum("nj,nj->n", Hs[:, 2], np.column_stack([uv_px, np.ones(len(uv_px))]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        area = np.abs(np.linalg.det(Hs)) / w**3
+    return np.sqrt(np.where(w > 0.0, area, 0.0))
+
+
+def _shift(by_px: Array) -> Array:
+    """(N, 3, 3) homographies that add `by_px` (N, 2)."""
+    shifts = np.tile(np.eye(3), (len(by_px), 1, 1))
+    shifts[:, :2, 2] = by_px
+    return shifts
