@@ -35,7 +35,6 @@ from pipelines.frontend.view import (
     complete_view,
     prepare_frame,
 )
-from pipelines.geometry import invert_T, transform_points
 from pipelines.mapping.correction import FrameAnchors, MapCorrection, correct_map
 from pipelines.mapping.local_mapping import LocalMapping
 from pipelines.mapping.sightings import static_sightings
@@ -334,9 +333,7 @@ class DyObSlam:
             tracks, is_keyframe = self._mapping.integrate(self.map, view, tracked)
         if is_keyframe:
             self.places.add(len(self.map.keyframes) - 1, view.features.descriptors)
-        T = tracked.T_world_camera
-        depth_m = transform_points(invert_T(T), self.map.position_m[tracks.point_ids])[:, 2]
-        self._tracker.remember(view, T, tracks, depth_m)
+        self._tracker.remember(view, tracked.T_world_camera, tracks, self.map)
         self._static_tracks = tracks
         return is_keyframe
 

@@ -110,8 +110,10 @@ def _align(
             last.view.gray, view.gray, uv_from, start[other], tolerance_px, by_flow[other]
         )
         uv[other[ok[other]]] = placed[ok[other]]
-    which = np.flatnonzero((rows >= 0) & np.isfinite(uv).all(axis=1))
+    which = np.flatnonzero((rows >= 0) & (ok | by_flow))
     Hs = last.patches.homographies(camera, rows[which], T_world_camera)
+    use = last.patches.are_of_use(rows[which], Hs)
+    which, Hs = which[use], Hs[use]
     for part, sheet, places in last.patches.sheets(rows[which], Hs, view.gray.shape):
         own = which[part]
         sure = np.ones(len(own), bool)

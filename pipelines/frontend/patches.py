@@ -24,6 +24,7 @@ from pipelines.types import Array, Image, StereoCamera
 SIDE_PX = 21  # the window of the alignment, its gradients, and the fraction of the point's pixel
 _HALF = SIDE_PX // 2
 _MIN_GROWTH, _MAX_GROWTH = 0.85, 2.0  # sizes beyond which a patch is cut anew
+_TOO_FAR = 2.0  # times beyond these, a patch is of no use at all
 _PIXELS = np.stack(
     [g.ravel() for g in np.meshgrid(np.arange(SIDE_PX), np.arange(SIDE_PX))] + [np.ones(SIDE_PX**2)]
 ).astype(np.float32)  # (3, 441) homogeneous pixels of a patch
@@ -79,6 +80,11 @@ class Patches:
         T = invert_T(T_world_camera) @ self.T_world_camera[rows]
         return K @ (T[:, :3, :3] @ np.linalg.inv(K) + T[:, :3, 3:] @ self.plane[rows, None])
 
+    def are_of_use(self, rows: NDArray[np.int64], Hs: Array) -> NDArray[np.bool_]:
+        """(M,) which patches can be warped by homographies, and still show anything then."""
+        growth = _growth(Hs, self.uv_px[rows])
+        return (growth > _MIN_GROWTH / _TOO_FAR) & (growth < _MAX_GROWTH * _TOO_FAR)
+
     def sheets(
         self, rows: NDArray[np.int64], Hs: Array, shape: tuple[int, int]
     ) -> Iterator[tuple[slice, Image, Array]]:
@@ -106,7 +112,7 @@ class Patches:
         within = uv - self.corner_px[rows]
         seen_at = np.einsum("nij,nj->ni", Hs, np.column_stack([uv, np.ones(n)]))
         seen_at = seen_at[:, :2] / seen_at[:, 2:]
-        back = np.linalg.inv(_shift(within - seen_at) @ Hs @ _shift(self.corner_px[rows].astype(float)))
+        back = np.linalg.inv(_shift(within - seen_at) @ Hs @ _shift(uv - within))
         source = (back.reshape(-1, 3).astype(np.float32) @ _PIXELS).reshape(n, 3, -1)
         source[:, :2] /= source[:, 2:]
         np.clip(source[:, :2], 0, SIDE_PX - 1, out=source[:, :2])

@@ -32,12 +32,13 @@ from pipelines.frontend.patches import Patches, renew_patches
 from pipelines.frontend.rgbd_odometry import estimate_rgbd_odometry
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
-from pipelines.geometry import invert_T, project_stereo, transform_points
+from pipelines.geometry import invert_T, project_stereo, rotation_angle_deg, transform_points
 from pipelines.mapping.fusion import rename_points
 from pipelines.mapping.sparse_map import SparseMap
 from pipelines.observations import Tracks
 from pipelines.types import Array, MotionHypothesis, TrackingStatus
 
+_SEEN_ALIKE_DEG = 1.0  # turned by less, a patch looks the same
 _GATE = 2.0  # inlier limits: observations farther from the chosen hypothesis adjust it later
 _REGAINED_NEAR = 0.5  # of the way predicted since the last good frame, to be about there
 _RELOCALISED_SHARE = 0.5  # of descriptor matches that must agree with a pose found by them
@@ -108,11 +109,11 @@ class Tracker:
         self.motion = ConstantVelocity(T_world_camera, view.timestamp_s)
         return self.motion
 
-    def remember(self, view: View, T_world_camera: Array, tracks: Tracks, depth_m: Array) -> None:
-        """Keep what the next frame will be tracked from.
-
-        T_world_camera: (4, 4) of the view. depth_m: (N,) of the tracks' points in it.
-        """
+    def remember(
+        self, view: View, T_world_camera: Array, tracks: Tracks, sparse_map: SparseMap
+    ) -> None:
+        """Keep what the next frame will be tracked from: a view from (4, 4), and what it saw."""
+        points = sparse_map.position_m[tracks.point_ids]
         patches = renew_patches(
             Patches.empty() if self._last is None else self._last.patches,
             self.camera,
@@ -120,7 +121,7 @@ class Tracker:
             T_world_camera,
             tracks.point_ids,
             tracks.uv_px,
-            depth_m,
+            transform_points(invert_T(T_world_camera), points)[:, 2],
             self.noise.sigma_disparity_px,
         )
         self._last = LastFrame(view, tracks, patches=patches)
@@ -161,9 +162,11 @@ class Tracker:
             estimate = self._adjust(sparse_map, measured.tracks, T)
         if not self._is_trusted(estimate, T_predicted, hypothesis):
             return self._lost(T_predicted, measured.tracks)
-        first = not self.noise.is_learned
+        # The weights were guesses, or the patches were warped for another view than this
+        turned_deg = rotation_angle_deg(invert_T(T_predicted) @ estimate.T_world_camera)
+        again = not self.noise.is_learned or turned_deg > _SEEN_ALIKE_DEG
         self._learn_noise(sparse_map, measured, estimate)
-        if first and measured.sources_px:  # the weights were guesses: again, as they taught
+        if again and measured.sources_px:
             measured = self._measure(view, sparse_map, estimate.T_world_camera)
             estimate = self._adjust(sparse_map, measured.tracks, estimate.T_world_camera)
         with stage("local_map"):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipelines.frontend.sampling import sample_bilinear, sample_disparity
+from pipelines.frontend.sampling import disparity_slopes, sample_bilinear, sample_disparity
 
 H, W = 60, 80
 V, U = np.mgrid[:H, :W].astype(np.float64)
@@ -26,6 +26,25 @@ def test_disparity_of_a_plane_is_exact_between_pixels(coefficients):
     a, b, c = coefficients
     found = sample_disparity(plane(*coefficients).astype(np.float32), uv, 0.1)
     np.testing.assert_allclose(found, a + uv @ [b, c], atol=1e-3)
+
+
+@pytest.mark.parametrize("coefficients", COEFFICIENTS)
+def test_slopes_of_a_plane_are_exact_where_the_window_is_whole(coefficients):
+    uv = random_places(300, margin=5.0)
+    found = disparity_slopes(plane(*coefficients).astype(np.float32), uv, 0.1)
+    np.testing.assert_allclose(found, np.tile(coefficients[1:], (300, 1)), atol=1e-4)
+
+
+def test_slopes_average_noise_and_are_none_where_little_is_known():
+    rng = np.random.default_rng(3)
+    sigma = 0.2
+    noisy = (plane(20.0, 0.03, 0.04) + rng.normal(0, sigma, (H, W))).astype(np.float32)
+    error = disparity_slopes(noisy, random_places(800, margin=5.0), sigma) - [0.03, 0.04]
+    expected = sigma / np.sqrt(25 * 8.0)  # 25 pixels, whose mean square from the middle is 8
+    assert 0.8 * expected < np.std(error) < 1.3 * expected
+    unknown = np.full((H, W), np.nan, np.float32)
+    np.testing.assert_array_equal(disparity_slopes(unknown, random_places(5, 5.0), 0.1), 0.0)
+    assert disparity_slopes(noisy, np.empty((0, 2)), 0.1).shape == (0, 2)
 
 
 def test_disparity_averages_noise():

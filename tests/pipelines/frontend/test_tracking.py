@@ -105,7 +105,7 @@ class Run:
             TrackingStatus.OK, MotionHypothesis.FIRST_FRAME, T, np.zeros((6, 6)), nothing,
             np.zeros(0, bool), np.nan, nothing.point_ids,
         )  # fmt: skip
-        self.tracker.remember(view, self.mapping.integrate(self.map, view, first)[0])
+        self.tracker.remember(view, T, self.mapping.integrate(self.map, view, first)[0], self.map)
         return self
 
     def track(self, T, index, **how):
@@ -113,7 +113,8 @@ class Run:
         tracked = self.tracker.track(view, self.map)
         if tracked.status is TrackingStatus.OK:
             self.tracker.motion.update(tracked.T_world_camera, view.timestamp_s)
-            self.tracker.remember(view, self.mapping.integrate(self.map, view, tracked)[0])
+            tracks, _ = self.mapping.integrate(self.map, view, tracked)
+            self.tracker.remember(view, tracked.T_world_camera, tracks, self.map)
         else:
             self.tracker.forget_flow()
         return tracked

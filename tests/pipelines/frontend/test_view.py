@@ -73,11 +73,13 @@ def test_features_know_their_depth_between_pixels():
     assert (features.uv_px % 1 != 0).any()  # coarser levels lie between pixels
 
 
-def test_disparity_is_bf_over_depth_plus_the_learned_offset():
+def test_disparity_is_bf_over_depth_plus_the_learned_offset_of_far_points():
     depth = slanted_depth()
     plain, moved = view_of(depth), view_of(depth, offset_px=0.75)
     np.testing.assert_allclose(plain.disparity_px, CAMERA.bf / depth, rtol=1e-5)
-    np.testing.assert_allclose(moved.disparity_px - plain.disparity_px, 0.75, atol=1e-4)
+    # None of it at ten baselines, where rigs are calibrated
+    share = 1 - 10 / CAMERA.fx * plain.disparity_px
+    np.testing.assert_allclose(moved.disparity_px - plain.disparity_px, 0.75 * share, atol=1e-4)
     assert (moved.features.depth_m < plain.features.depth_m).all()
     assert plain.disparity_px.dtype == np.float32
 
