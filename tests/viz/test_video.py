@@ -118,26 +118,18 @@ def test_what_cannot_be_made_is_said(short_run, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_browser_plays_it(short_run, tmp_path):
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("needs chromium (Debian: apt-get install chromium)")
-    from playwright.sync_api import sync_playwright
-
+def test_a_browser_plays_it(short_run, tmp_path, browser):
     write_video(short_run, tmp_path / "run.mp4", width=320)
     page_file = tmp_path / "page.html"
     page_file.write_text("<video src='run.mp4' muted loop></video>")
-    flags = "--no-sandbox --disable-quic --no-first-run --disable-background-networking"
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=flags.split())
-        page = browser.new_page()
-        page.goto(page_file.as_uri())
-        page.evaluate("document.querySelector('video').play()")
-        page.wait_for_function("document.querySelector('video').currentTime > 0.2")
-        state = page.evaluate(
-            "(v => [v.readyState, v.videoWidth, v.duration, v.error])"
-            "(document.querySelector('video'))"
-        )
-        browser.close()
+    context = browser.new_context()
+    page = context.new_page()
+    page.goto(page_file.as_uri())
+    page.evaluate("document.querySelector('video').play()")
+    page.wait_for_function("document.querySelector('video').currentTime > 0.2")
+    state = page.evaluate(
+        "(v => [v.readyState, v.videoWidth, v.duration, v.error])(document.querySelector('video'))"
+    )
+    context.close()
     assert state[0] >= 2 and state[1] == 320 and state[3] is None
     assert state[2] == pytest.approx(0.8, abs=0.02)

@@ -99,13 +99,7 @@ class LiveServer(PageServer):
             browser.close()
 
     def rules(self) -> Rules:
-        from tornado.web import RequestHandler
         from tornado.websocket import WebSocketClosedError, WebSocketHandler
-
-        @guarded
-        class Page(RequestHandler):
-            def get(self) -> None:
-                self.finish(self.server.page)
 
         @guarded
         class Live(WebSocketHandler):
@@ -136,4 +130,4 @@ class LiveServer(PageServer):
             def on_close(self) -> None:
                 self.server._browsers.discard(self)
 
-        return [(r"/", Page, {"server": self}), (r"/live", Live, {"server": self})]
+        return [*super().rules(), (r"/live", Live, {"server": self})]

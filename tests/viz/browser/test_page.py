@@ -12,24 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from app.system_libraries import browser as find_browser
 from pipelines.config import Config
 from pipelines.types import Frame, FrameResult, MotionHypothesis, TrackingStatus
 from viz.browser import export_scene
 from viz.browser.live import LiveViewer
 from viz.browser.recorded import RecordedServer
 
-FLAGS = [
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
 SIZE = {"width": 900, "height": 560}
 WAIT_S = 40.0
 
@@ -81,19 +69,6 @@ class Visit:
             f"(() => {{ const s = document.getElementById('slider'); s.value = {k}; "
             "s.dispatchEvent(new Event('input')); })()"
         )
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Chromium without a display. For this module alone: playwright's loop would disturb others."""
-    program = find_browser()
-    if program is None:
-        pytest.skip("needs chromium, which is not there: apt-get install chromium")
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
-    with playwright.sync_playwright() as running:
-        browser = running.chromium.launch(executable_path=program, args=FLAGS)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
