@@ -24,7 +24,7 @@ from viz.overlay import write_image
 from viz.playback import Playback, build_playback
 from viz.points import check_names, draw_points
 from viz.scene import View
-from viz.tags import draw_tags
+from viz.tags import draw_ends, draw_tags
 from viz.views import VIEW_NAMES as STILL_VIEWS
 from viz.views import choose_view
 
@@ -103,6 +103,7 @@ def _draw_paths(picture: Image, view: View, result: Result, playback: Playback, 
     for line in scene.polylines:
         draw_polyline(picture, view, line, dark=dark)
     taken = draw_legend(picture, scene, view, result, dark=dark)
+    taken = draw_ends(picture, view, scene, taken, dark=dark)
     draw_tags(picture, view, scene, taken, dark=dark)
 
 

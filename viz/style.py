@@ -21,7 +21,7 @@ INK: Color = (38, 38, 42)
 GREY: Color = (150, 150, 150)
 
 ESTIMATE: Color = (0, 100, 190)  # blue: the camera as estimated
-TRUTH: Color = (245, 178, 66)  # amber, drawn wide beneath the estimate: the camera as it was
+TRUTH: Color = (136, 136, 144)  # grey, as no object is: what truly was, in every view
 FRUSTUM: Color = (90, 160, 220)
 START: Color = (0, 140, 100)
 END: Color = (170, 50, 120)
@@ -51,6 +51,7 @@ BACKGROUNDS: dict[str, Color] = {"white": WHITE, "black": (16, 18, 22)}
 # Lighter kinds of the colours above that would not stand out from a dark ground.
 ON_DARK: dict[Color, Color] = {
     ESTIMATE: (90, 180, 255),
+    TRUTH: (172, 172, 180),
     START: (70, 215, 165),
     END: (240, 125, 195),
 }
