@@ -21,7 +21,7 @@ INK: Color = (38, 38, 42)
 GREY: Color = (150, 150, 150)
 
 ESTIMATE: Color = (0, 100, 190)  # blue: the camera as estimated
-TRUTH: Color = (136, 136, 144)  # grey, as no object is: what truly was, in every view
+TRUTH: Color = (116, 116, 124)  # grey, as no object is: what truly was, in every view
 FRUSTUM: Color = (90, 160, 220)
 START: Color = (0, 140, 100)
 END: Color = (170, 50, 120)

@@ -52,7 +52,7 @@ def test_run_counts_what_it_did(result: Path) -> None:
 
 def test_run_annotates_each_frame(result: Path) -> None:
     names = [file.name for file in sorted((result / "frames").iterdir())]
-    assert names == [f"{index:06d}.png" for index in range(N_FRAMES)]
+    assert names == [f"{index:06d}.jpg" for index in range(N_FRAMES)]
 
 
 def test_eval_restores_metrics_that_were_lost(result: Path) -> None:

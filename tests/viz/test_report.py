@@ -186,6 +186,14 @@ def test_a_scene_too_large_for_the_page_lies_beside_it(tmp_path, scene, monkeypa
     assert not (folder / "scene.html").exists() and not (folder / "report.html").exists()
 
 
+def test_frames_of_before_the_batch_are_said_to_be_so(tmp_path, scene):
+    folder = write(tmp_path / "result")
+    assert "known live" not in words(write_report(load_result(folder)).read_text())
+    metrics = load_result(folder).metrics
+    ResultWriter(folder).write_metrics({**metrics, "batch": {"accepted": True}}, "")
+    assert "known live" in words(write_report(load_result(folder)).read_text())
+
+
 def test_an_object_is_summed_up(tmp_path):
     result = load_result(write(tmp_path / "result"))
     car, parked = summarise_objects(result, build_playback(result))

@@ -49,6 +49,19 @@ def test_frames_above_and_map_below(short_run, tmp_path):
     assert path.read_bytes().index(b"moov") < path.read_bytes().index(b"mdat")  # plays at once
 
 
+def test_halves_of_before_and_after_the_batch_say_so(short_run, tmp_path):
+    """In words at the map's top left, where else nothing is; not where both are the same."""
+    pictures = {}
+    for is_optimised in (False, True):
+        run = replace(short_run, metrics={"batch": {"accepted": is_optimised}})
+        pictures[is_optimised], _ = decode(write_video(run, tmp_path / "run.mp4", width=640))
+    differs = np.abs(pictures[True].astype(int) - pictures[False]).max(3) > 60
+    frame_px = round(64 / 201 * 640 / 2) * 2
+    for k in range(8):
+        v, u = np.nonzero(differs[k])
+        assert len(v) > 100 and v.min() >= frame_px and v.max() < frame_px + 60 and u.min() < 60
+
+
 def test_without_annotated_frames_the_map_fills_the_video(short_run, tmp_path, caplog):
     shutil.rmtree(tmp_path / "frames")
     pictures, _ = decode(write_video(short_run, tmp_path / "run.mp4", width=320))
