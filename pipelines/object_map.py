@@ -24,6 +24,8 @@ from pipelines.object_types import ObjectEstimates, ObjectState
 from pipelines.types import Array
 
 _SAME_S = 1e-6
+_MEASURED = (ObjectState.MOVING, ObjectState.STOPPED)  # of others, depth is too poor for a shape
+_MARGIN = 1.3  # extents, as they leave out the outermost points
 
 
 def write_object_map(folder: Path, log: Sequence[FrameObservations] | None = None) -> None:
@@ -53,13 +55,14 @@ def object_points(
     """Points (N, 3) in the world and the ids (N,) of their objects, each at its object's last pose.
 
     A point is taken from the last frame that saw it, when its filter knew it best, and rides on
-    the object from there. timestamps_s (F,), Ts_world_camera (F, 4, 4): of the tracked frames.
+    the object from there. What lies far beyond the object's extent is none of it: masks spill.
+    timestamps_s (F,), Ts_world_camera (F, 4, 4): of the tracked frames.
     """
     seen = Sightings.concatenate(*(entry.sightings for entry in log))
     seen = seen[seen.object_id != STATIC]
     camera_of = _cameras(log, timestamps_s, Ts_world_camera)
     known = np.isfinite(objects.Ts_world_object).all((1, 2))
-    known &= objects.state != str(ObjectState.COASTING)
+    known &= np.isin(objects.state, [str(state) for state in _MEASURED])
     row_of = {
         (int(objects.object_id[row]), int(objects.frame_index[row])): row
         for row in np.flatnonzero(known).tolist()
@@ -74,12 +77,20 @@ def object_points(
     chosen = np.array(list(last_seen.values()), np.int64)
     seen = seen[chosen]
     pairs = list(zip(seen.object_id.tolist(), seen.frame_index.tolist(), strict=True))
-    Ls = objects.Ts_world_object[[row_of[pair] for pair in pairs]].reshape(-1, 4, 4)
-    last_Ls = objects.Ts_world_object[[last_row[j] for j, _ in pairs]].reshape(-1, 4, 4)
+    rows = np.array([row_of[pair] for pair in pairs], np.int64)
+    last_rows = np.array([last_row[j] for j, _ in pairs], np.int64)
     Xs = np.array([camera_of[frame] for _, frame in pairs]).reshape(-1, 4, 4)
-    moved = last_Ls @ invert_T(Ls) @ Xs
-    points_m = np.einsum("nij,nj->ni", moved[:, :3, :3], seen.position_m) + moved[:, :3, 3]
-    return points_m, seen.object_id
+    on_object = _moved(invert_T(objects.Ts_world_object[rows]) @ Xs, seen.position_m)
+    last_Ls = objects.Ts_world_object[last_rows]
+    centers = _moved(invert_T(last_Ls), objects.centers_m[last_rows])
+    reach = 0.5 * _MARGIN * objects.extents_m[last_rows]
+    belongs = (np.abs(on_object - centers) <= reach).all(axis=1)
+    return _moved(last_Ls, on_object)[belongs], seen.object_id[belongs]
+
+
+def _moved(Ts: Array, points_m: Array) -> Array:
+    """Each of the points (N, 3) by its own transform of (N, 4, 4)."""
+    return np.asarray(np.einsum("nij,nj->ni", Ts[:, :3, :3], points_m) + Ts[:, :3, 3])
 
 
 def _cameras(

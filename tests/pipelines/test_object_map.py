@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +74,20 @@ def test_points_are_where_their_objects_were_last():
     expected = {4: pose(4, N - 2), 7: pose(7, 0)}  # where 4 was predicted to be, nothing was seen
     for object_id, T in expected.items():
         np.testing.assert_allclose(points_m[ids == object_id], transform_points(T, SHAPE))
+
+
+def test_what_is_not_on_the_object_is_left_out():
+    """Points of a house seen through its windows, and frames in which too little is known."""
+    log, objects = make_log(), make_objects()
+    far = log[-1].sightings.position_m + np.array([0.0, 0.0, 15.0])
+    spilled = replace(log[-1].sightings, position_m=far, track_id=log[-1].sightings.track_id + 100)
+    log.append(replace(log[-1], sightings=spilled))
+    points_m, _ = object_points(objects, log, STAMPS, Xs)
+    assert len(points_m) == 40
+    unknown = objects.state.astype("U16")
+    unknown[objects.object_id == 7] = "unknown"
+    _, ids = object_points(replace(objects, state=unknown), log, STAMPS, Xs)
+    assert set(ids.tolist()) == {4}
 
 
 def test_a_lost_camera_and_an_object_without_a_pose_leave_no_points():
