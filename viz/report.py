@@ -94,7 +94,7 @@ def _headline(result: Result) -> Html:
     frames = run.get("frames", len(stamps))
     facts = [(f"{run.get('tracked', len(stamps))} of {frames}", "frames tracked")]
     if len(stamps) > 1:
-        facts.append((f"{way_m:.1f} m", f"camera's way in {stamps[-1] - stamps[0]:.1f} s"))
+        facts.append((f"{way_m:.1f} m", f"camera's way in {stamps[-1] - stamps[0]:.1f}\u00a0s"))
     facts.append((f"{len(result.static_points_m):,}", "points of the static map"))
     if camera.get("ate_rmse_m") is not None:
         facts.append((f"{100 * camera['ate_rmse_m']:.2g} cm", "off the true path (ATE)"))
