@@ -35,7 +35,9 @@ def write_object_map(folder: Path, log: Sequence[FrameObservations] | None = Non
     """
     if log is None:
         log = read_observations(folder / names.OBSERVATIONS)
-    objects = read_objects(folder / names.OBJECTS_CSV)
+    objects = ObjectEstimates.empty()
+    if (folder / names.OBJECTS_CSV).exists():
+        objects = read_objects(folder / names.OBJECTS_CSV)
     trajectory = read_tum(folder / names.CAMERA_TUM)
     points_m, ids = object_points(objects, log, *trajectory)
     moving = objects[objects.state == str(ObjectState.MOVING)]

@@ -114,12 +114,14 @@ def test_the_file_holds_points_and_ways_in_the_colours_of_ids(tmp_path: Path):
     np.testing.assert_allclose(np.asarray(cloud.points)[-(N - 1) :], way, atol=1e-5)
 
 
-@pytest.mark.parametrize("n_objects", [0, 2])
-def test_without_a_log_there_are_the_ways_alone(tmp_path: Path, n_objects: int):
+@pytest.mark.parametrize("case", ["objects", "no objects", "no file"])
+def test_without_a_log_there_are_the_ways_alone(tmp_path: Path, case: str):
     write_tum(tmp_path / names.CAMERA_TUM, STAMPS, Xs)
     objects = make_objects()
-    write_objects(tmp_path / names.OBJECTS_CSV, objects if n_objects else objects[:0])
+    if case != "no file":
+        chosen = objects if case == "objects" else objects[:0]
+        write_objects(tmp_path / names.OBJECTS_CSV, chosen)
     write_object_map(tmp_path)
     cloud = o3d.t.io.read_point_cloud(tmp_path / names.OBJECTS_MAP)
     found = len(cloud.point.positions) if "positions" in cloud.point else 0
-    assert found == (N - 1 if n_objects else 0)
+    assert found == (N - 1 if case == "objects" else 0)
