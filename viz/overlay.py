@@ -165,7 +165,7 @@ def _status_texts(result: FrameResult) -> list[str]:
 class FrameWriter:
     """A sink that writes every n-th annotated frame to a folder from a thread of its own.
 
-    JPEG is made in a tenth of the time of a PNG, and takes a fifth of its room.
+    JPEG is made in a small part of the time of a PNG, and takes a quarter of its room.
     The run loop waits only when the thread is `WAITING` pictures behind, so that memory stays flat
     and no picture is lost. A disk that refuses ends the pictures with a warning, not the run.
     """
