@@ -21,6 +21,7 @@ from app.environment import ROOT
 from pipelines.errors import DyObError
 
 FOLDER = ROOT / "notebooks"
+SETTINGS = FOLDER / ".jupyter"  # no questions about builds and news before the first look
 _START_S = 120.0  # s, which a server may take until it answers; the first start compiles much
 _STOP_S = 15.0  # s, to end its kernels in peace
 
@@ -31,7 +32,11 @@ def notebook(arguments: Namespace) -> int:
     server = subprocess.Popen(
         _command(page, arguments),
         cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": _with_root(os.environ.get("PYTHONPATH", ""))},
+        env={
+            **os.environ,
+            "PYTHONPATH": _before("PYTHONPATH", ROOT),
+            "JUPYTER_CONFIG_PATH": _before("JUPYTER_CONFIG_PATH", SETTINGS),
+        },
         stdin=subprocess.DEVNULL,
         start_new_session=True,  # else Ctrl-C reaches it too, and it asks whether one is sure
     )
@@ -79,8 +84,10 @@ def _command(page: str, arguments: Namespace) -> list[str]:
     return [sys.executable, "-m", "jupyterlab", *settings]
 
 
-def _with_root(paths: str) -> str:
-    return os.pathsep.join([str(ROOT), *([paths] if paths else [])])
+def _before(variable: str, folder: Path) -> str:
+    """The folder, and after it what the environment names in a variable of paths."""
+    paths = os.environ.get(variable, "")
+    return os.pathsep.join([str(folder), *([paths] if paths else [])])
 
 
 def _address(server: subprocess.Popen[bytes], page: str) -> str:

@@ -37,6 +37,7 @@ from pipelines.io.objects import write_table as write_csv
 from pipelines.io.observations import read_camera, read_map_points, read_observations
 from pipelines.io.ply import read_point_cloud, write_point_cloud
 from pipelines.io.trajectory import write_kitti, write_tum
+from pipelines.object_map import write_object_map
 from pipelines.object_types import ObjectEstimates
 from pipelines.types import Array
 
@@ -84,6 +85,7 @@ def optimise_result(
         _restore(folder, start)
     else:
         _write(folder, start, result)
+    write_object_map(folder, start.log)
     block = _block(result, config, time.perf_counter() - begin)
     _tell(result, block)
     metrics_path = folder / names.METRICS_JSON

@@ -36,6 +36,7 @@ from pipelines.io.result import (
     run_metrics,
 )
 from pipelines.lasting_map import LastingMap, note_end, note_start
+from pipelines.object_map import write_object_map
 from pipelines.progress import Progress, resume_progress
 from pipelines.types import Array, Frame, FrameResult
 
@@ -329,6 +330,7 @@ def _write(writer: ResultWriter, sequence: Sequence, slam: DyObSlam, progress: P
             if now is not then
         }
         progress.recorder.finish(static_map.track_ids, corrected)
+    write_object_map(writer.folder)
     metrics = {
         "run": run_metrics(
             results,

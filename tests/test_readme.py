@@ -66,8 +66,8 @@ def test_each_command_parses(command: str) -> None:
 
 
 @pytest.mark.parametrize("picture", re.findall(r"\]\((\.github/[^)]+)\)", README))
-def test_each_picture_is_there(picture: str) -> None:
-    assert (ROOT / picture).is_file()
+def test_each_picture_is_there_and_light(picture: str) -> None:
+    assert (ROOT / picture).stat().st_size < 400_000
 
 
 @pytest.mark.parametrize("path", sorted(set(re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.py)`", README))))

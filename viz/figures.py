@@ -79,6 +79,12 @@ def metric_unit(values_m: Array) -> tuple[float, str]:
     return (100.0, "cm") if largest < 1.0 else (1.0, "m")
 
 
+def digits(value: float) -> str:
+    """A positive number with three digits that count, never as a power of ten."""
+    power = int(np.floor(np.log10(value))) if value > 0 else 0
+    return f"{value:.{int(np.clip(2 - power, 0, 6))}f}"
+
+
 def two_digits(value: float) -> str:
     """A number beside a bar: two digits that count."""
     return f"{value:.0f}" if value >= 9.95 else f"{value:#.2g}"

@@ -1,6 +1,6 @@
-"""What explains a map picture: title, legend, scale bar, and the marks at start and end.
+"""What explains a map picture: title, legend and scale bar.
 
-Owns words and marks over a drawn map. Knows no renderer.
+Owns words over a drawn map; those at places in it are the tags'. Knows no renderer.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from pipelines.io.result import Result
 from pipelines.types import Image
 from viz import style
+from viz.figures import digits
 from viz.lines import draw_segment
 from viz.object_marks import Box
 from viz.scene import Polyline, Scene, View
@@ -47,9 +48,8 @@ def draw_legend(
         KeyEntry(label, tuple(line.color for line in lines), lines[0].width_px)
         for label, lines in reversed(entries.items())
     ]
-    taken = _draw_ends(picture, scene, view, dark)
-    taken.append(draw_title(picture, view, title_lines(result), dark=dark))
-    return taken + draw_key_and_scale(picture, view, key, scene, dark=dark)
+    title = draw_title(picture, view, title_lines(result), dark=dark)
+    return [title, *draw_key_and_scale(picture, view, key, scene, dark=dark)]
 
 
 def draw_key_and_scale(
@@ -114,12 +114,6 @@ def title_lines(result: Result) -> list[str]:
     return lines
 
 
-def digits(value: float) -> str:
-    """A positive number with three digits that count, never as a power of ten."""
-    power = int(np.floor(np.log10(value))) if value > 0 else 0
-    return f"{value:.{int(np.clip(2 - power, 0, 6))}f}"
-
-
 def text_size_px(view: View) -> int:
     """Size of words over a map picture, legible whatever the picture's size."""
     W = view.size[0]
@@ -137,12 +131,14 @@ def _inks(dark: bool) -> tuple[style.Color, style.Color]:
     return (style.WHITE if dark else style.INK), style.BACKGROUNDS["black" if dark else "white"]
 
 
-def draw_title(picture: Image, view: View, lines: list[str], *, dark: bool = False) -> Box:
-    """Lines of text at the top left, the first of them large; the part that they take."""
+def draw_title(
+    picture: Image, view: View, lines: list[str], *, large: bool = True, dark: bool = False
+) -> Box:
+    """Lines of text at the top left, the first `large` or not; the part that they take."""
     ink, panel = _inks(dark)
     text_px, margin = _sizes(view)
-    sizes = [round(1.35 * text_px)] + [text_px] * (len(lines) - 1)
-    weights = [600] + [400] * (len(lines) - 1)
+    sizes = [round((1.35 if large else 1.0) * text_px)] + [text_px] * (len(lines) - 1)
+    weights = [600 if large else 400] + [400] * (len(lines) - 1)
     widths = [style.text_size(*args)[0] for args in zip(lines, sizes, weights, strict=True)]
     height = sum(round(1.45 * size) for size in sizes)
     pad = round(0.6 * text_px)
@@ -216,37 +212,3 @@ def _draw_scale_bar(picture: Image, view: View, dark: bool, *, at_left: bool = F
     at = ((left + right - style.text_size(label, text_px)[0]) // 2, v - round(0.6 * text_px))
     style.draw_text(picture, label, at, text_px, ink)
     return box
-
-
-def _draw_ends(picture: Image, scene: Scene, view: View, dark: bool) -> list[Box]:
-    """A disc and a word at the first and the last camera."""
-    import cv2
-
-    _, panel = _inks(dark)
-    text_px, _ = _sizes(view)
-    taken: list[Box] = []
-    ends = (("end", scene.path_m[-1:], style.END), ("start", scene.path_m[:1], style.START))
-    apart_px = view.project(scene.path_m[-1:])[0][0] - view.project(scene.path_m[:1])[0][0]
-    # Words of ends that are close go to different sides, or one would lie under the other's disc.
-    are_close = abs(apart_px[0]) < 3.5 * text_px and abs(apart_px[1]) < 3.0 * text_px
-    above = ("end" if apart_px[1] < 0 else "start") if are_close else ""
-    for word, point, plain_color in ends:
-        color = style.on_dark(plain_color) if dark else plain_color
-        uv, depth = view.project(point)
-        u, v = (int(x) for x in np.round(np.clip(uv[0], -1e4, 1e4)))
-        if depth[0] <= 0 or not (0 <= u < view.size[0] and 0 <= v < view.size[1]):
-            continue
-        r = max(4, round(0.42 * text_px))
-        cv2.circle(picture, (u, v), r + max(1, r // 4), panel, -1, cv2.LINE_AA)
-        cv2.circle(picture, (u, v), r, color, -1, cv2.LINE_AA)
-        width = style.text_size(word, text_px, 600)[0]
-        left = int(np.clip(u - width // 2, 2, max(view.size[0] - width - 2, 2)))
-        base = v + r + round(1.25 * text_px)
-        if word == above or base + text_px // 3 > view.size[1]:
-            base = v - r - round(0.5 * text_px)
-        pad = text_px // 4
-        box = (left - pad, base - text_px, left + width + pad, base + pad + 1)
-        style.draw_panel(picture, box, panel, 0.7)
-        style.draw_text(picture, word, (left, base), text_px, color, 600)
-        taken += [box, (u - r, v - r, u + r, v + r)]
-    return taken

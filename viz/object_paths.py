@@ -11,7 +11,7 @@ import numpy as np
 
 from pipelines.geometry import invert_T
 from pipelines.object_types import ObjectEstimates, ObjectState
-from pipelines.types import Array
+from pipelines.types import Array, ObjectTruth
 from viz import style
 from viz.object_marks import KMH, speed_words
 
@@ -74,6 +74,19 @@ def object_paths(objects: ObjectEstimates) -> tuple[list[Polyline], list[Tag]]:
             words += f" {speed_words(float(np.nanmedian(speeds)))}"
         tags.append(Tag(own.centers_m[-1], words, color))
     return lines, tags
+
+
+def true_object_paths(truth: ObjectTruth) -> list[Array]:
+    """Where the origins of true objects that ever move went, (N, 3) each, in pieces at gaps."""
+    paths: list[Array] = []
+    for object_id in np.unique(truth.object_id[truth.moving]):
+        rows = np.flatnonzero(truth.object_id == object_id)
+        rows = rows[np.argsort(truth.frame_index[rows], kind="stable")]
+        origins = truth.Ts_world_object[rows, :3, 3]
+        known = np.isfinite(origins).all(axis=1)
+        pieces = split_at_gaps(truth.frame_index[rows][known].astype(float), origins[known])
+        paths += [piece for piece in pieces if len(piece) > 1]
+    return paths
 
 
 def _path_of(rows: ObjectEstimates) -> Array:

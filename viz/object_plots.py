@@ -83,7 +83,7 @@ def _plot_speed(
     measured = np.where(own.state == str(ObjectState.MOVING), KMH * own.speed_mps, np.nan)
     axes.plot(seconds, measured, ".", color=hex_color(_darker(color)), ms=4, mew=0)
     if truth is not None:
-        axes.plot(truth[0] - start_s, truth[1], "--", color=hex_color(style.INK), lw=1.1)
+        axes.plot(truth[0] - start_s, truth[1], "--", color=hex_color(style.TRUTH), lw=1.4)
     axes.set_title(f"{object_id} {own.class_name[-1]}", fontsize=10.5, loc="left")
     axes.set_ylim(*_limits_kmh(measured, np.where(seen, filtered, np.nan), truth))
 
@@ -102,7 +102,7 @@ def _explain_speeds(figure: Any, with_truth: bool) -> None:
         "not seen, predicted": Line2D([], [], color=color, lw=1.7, ls=":"),
     }
     if with_truth:
-        entries["truth"] = Line2D([], [], color=hex_color(style.INK), lw=1.1, ls="--")
+        entries["truth"] = Line2D([], [], color=hex_color(style.TRUTH), lw=1.4, ls="--")
     figure.legend(
         list(entries.values()), list(entries), loc="outside lower center", ncols=len(entries)
     )
@@ -131,7 +131,9 @@ def plot_object_motion(figure: Any, result: Result) -> None:
     for block in shown:
         ids = _own_ids(block)
         frames = f"{block['object_frames']} frame{'s' * (block['object_frames'] > 1)}"
-        labels.append(f"{'+'.join(map(str, ids))} {block['class_name']}, {frames}")
+        own_class = result.objects.class_name[result.objects.object_id == ids[0]][-1:]
+        name = next(iter(own_class), block["class_name"])  # as this object is called elsewhere
+        labels.append(f"{'+'.join(map(str, ids))} {name}, {frames}")
         colors.append(hex_color(style.object_color(ids[0])))
     factor, unit = metric_unit(np.array([block["trans_rmse_m"] for block in shown]))
     for axes, name, scale, words in (

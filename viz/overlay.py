@@ -165,13 +165,14 @@ def _status_texts(result: FrameResult) -> list[str]:
 class FrameWriter:
     """A sink that writes every n-th annotated frame to a folder from a thread of its own.
 
+    JPEG is made in a small part of the time of a PNG, and takes a quarter of its room.
     The run loop waits only when the thread is `WAITING` pictures behind, so that memory stays flat
     and no picture is lost. A disk that refuses ends the pictures with a warning, not the run.
     """
 
     WAITING = 32
 
-    def __init__(self, every: int = 1, suffix: str = ".png") -> None:
+    def __init__(self, every: int = 1, suffix: str = ".jpg") -> None:
         if every < 1:
             raise ValueError(f"FrameWriter: expected every >= 1, found {every}")
         self.every, self.suffix = every, suffix
@@ -249,7 +250,9 @@ def write_image(path: Path | str, image: Image, *, sync: bool = True, compressio
 
     path = Path(path)
     png = [cv2.IMWRITE_PNG_COMPRESSION, compression]
-    options = [cv2.IMWRITE_JPEG_QUALITY, 92] if path.suffix in (".jpg", ".jpeg") else png
+    jpeg = [cv2.IMWRITE_JPEG_QUALITY, 92]  # colours at full size: marks are thin
+    jpeg += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    options = jpeg if path.suffix in (".jpg", ".jpeg") else png
     try:
         ok, data = cv2.imencode(path.suffix, np.ascontiguousarray(image[..., ::-1]), options)
     except cv2.error:

@@ -39,7 +39,8 @@ class Playback:
     frame_index, timestamps_s: (F,). Ts_world_camera: (F, 4, 4), the last measured pose where a
     frame was lost. is_tracked: (F,) bool. boxes: for each frame the objects in it. trails: of the
     objects that moved, drawn as far as the frame that is shown. pictures: the annotated frame of
-    each, or None. camera: intrinsics, or None where the run recorded none.
+    each, or None. camera: intrinsics, or None where the run recorded none. is_optimised: whether
+    poses and speeds are those after the global batch; the pictures show what was known live.
     """
 
     scene: Scene
@@ -51,6 +52,7 @@ class Playback:
     trails: tuple[Trail, ...]
     pictures: tuple[Path | None, ...]
     camera: StereoCamera | None
+    is_optimised: bool = False
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -82,6 +84,7 @@ def build_playback(result: Result) -> Playback:
         trails=tuple(_trails(boxes, stamps)),
         pictures=tuple(_picture(result.folder / names.FRAMES, frame) for frame in index),
         camera=_camera(result),
+        is_optimised=bool(result.metrics.get("batch", {}).get("accepted", False)),
     )
 
 

@@ -22,7 +22,7 @@ from pipelines.io.result import Result, load_result
 from pipelines.io.timings import TOTAL, WALL, stage_summaries
 from pipelines.types import Array
 from viz import object_plots, style
-from viz.figures import metric_unit, new_figure, save_figure, whole_ticks
+from viz.figures import digits, metric_unit, new_figure, save_figure, whole_ticks
 from viz.style import hex_color as _hex
 
 STILL_M = 0.05  # to either side is shown at the least
@@ -129,7 +129,7 @@ def _plot_position_errors(axes: Any, seconds: Array, errors_m: Array) -> None:
     factor, unit = metric_unit(errors_m)
     rmse = factor * float(np.sqrt(np.mean(errors_m**2)))
     axes.plot(seconds, factor * errors_m, ".-", color=_hex(style.ESTIMATE), lw=1.0, ms=4)
-    axes.axhline(rmse, color=_hex(style.INK), lw=1.0, ls="--", label=f"ATE {rmse:.3g} {unit}")
+    axes.axhline(rmse, color=_hex(style.INK), lw=1.0, ls="--", label=f"ATE {digits(rmse)} {unit}")
     title = "Distance to the truth after alignment"
     axes.set(xlabel="time (s)", ylabel=f"off by ({unit})", title=title)
     axes.margins(y=0.25)
@@ -163,7 +163,11 @@ def plot_rpe(figure: Any, result: Result) -> None:
         if len(values):
             rmse = float(np.sqrt(np.mean(values**2)))
             axes.axhline(
-                rmse, color=_hex(style.INK), lw=1.0, ls="--", label=f"RMSE {rmse:.3g} {unit}"
+                rmse,
+                color=_hex(style.INK),
+                lw=1.0,
+                ls="--",
+                label=f"RMSE {digits(rmse)} {unit}",
             )
             axes.legend(loc="upper right")
             axes.margins(y=0.35)  # room for the legend

@@ -31,6 +31,7 @@ KEY_OF_FRAMES = (
     "Green rings agree with the camera's pose, red crosses do not. What moves has a box and its "
     "speed."
 )
+LIVE_FRAMES = "They show what was known live; all else on this page is after the global batch."
 CAPTIONS = {
     "map_top": "The static map from above, with the ways of the camera and of all that moved.",
     "map_iso": "The same from the side.",
@@ -93,7 +94,7 @@ def _headline(result: Result) -> Html:
     frames = run.get("frames", len(stamps))
     facts = [(f"{run.get('tracked', len(stamps))} of {frames}", "frames tracked")]
     if len(stamps) > 1:
-        facts.append((f"{way_m:.1f} m", f"camera's way in {stamps[-1] - stamps[0]:.1f} s"))
+        facts.append((f"{way_m:.1f} m", f"camera's way in {stamps[-1] - stamps[0]:.1f}\u00a0s"))
     facts.append((f"{len(result.static_points_m):,}", "points of the static map"))
     if camera.get("ate_rmse_m") is not None:
         facts.append((f"{100 * camera['ate_rmse_m']:.2g} cm", "off the true path (ATE)"))
@@ -141,7 +142,8 @@ def _pictures(result: Result, playback: Playback) -> Html:
         body = f"<h2>Map</h2>{body}"
     chosen = _telling_frames(playback)
     if chosen:
-        body += f'<h2>Frames</h2><p class="soft">{KEY_OF_FRAMES}</p>'
+        said = f"{KEY_OF_FRAMES} {LIVE_FRAMES}" if playback.is_optimised else KEY_OF_FRAMES
+        body += f'<h2>Frames</h2><p class="soft">{said}</p>'
         for k in chosen:
             at = f"Frame {playback.frame_index[k]}, {playback.timestamps_s[k]:.2f} s"
             body += figure(_picture(playback, k), at, photo=True)

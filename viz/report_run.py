@@ -23,6 +23,7 @@ MEANINGS = {
     names.OBJECTS_CSV: "a row per object and frame: state, box, pose, motion, speed",
     names.OBJECTS_GT_CSV: "the true objects, in this run's world",
     names.STATIC_MAP: "the sparse static map with colours, PLY",
+    names.OBJECTS_MAP: "objects' points where they were last, and their ways, in their colours",
     names.METRICS_JSON: "errors and counts",
     names.METRICS_TXT: "the same for people",
     names.TIMINGS: "time of every stage and frame",

@@ -15,7 +15,13 @@ from pipelines.geometry import transform_points
 from pipelines.io.result import Result
 from pipelines.types import Array
 from viz import style
-from viz.object_paths import Polyline, Tag, object_paths, split_at_gaps
+from viz.object_paths import (
+    Polyline,
+    Tag,
+    object_paths,
+    split_at_gaps,
+    true_object_paths,
+)
 
 STRAY_QUANTILE = 0.95  # of the points' distances to the path: what lies far beyond is stray
 STRAY_FACTOR = 1.6
@@ -31,7 +37,8 @@ class Scene:
 
     points_m: (N, 3) without stray far points. colors: (N, 3) uint8. path_m: (F, 3) camera centres
     in order. up: (3,) unit vector. forward: (3,) unit, across up: where the camera looked first.
-    tags: one at the end of each moving object's path.
+    tags: one at the end of each moving object's path. true_paths: (N, 3) each, where the camera and
+    all that moves truly went, as far as that is known.
     """
 
     points_m: Array
@@ -41,6 +48,7 @@ class Scene:
     up: Array
     forward: Array
     tags: tuple[Tag, ...] = ()
+    true_paths: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,12 +92,13 @@ def build_scene(result: Result, *, keyframe_every: int | None = None) -> Scene:
     keep = near_path(result.static_points_m, path)
     points, colors = result.static_points_m[keep], result.static_colors[keep]
     polylines, tags = object_paths(result.objects)  # below the camera's path, which they may hide
+    true_paths: list[Array] = []
     if result.gt_Ts_world_camera is not None and result.gt_timestamps_s is not None:
         truth = result.gt_Ts_world_camera[:, :3, 3]
-        polylines += [
-            Polyline(piece, style.TRUTH, 6.0, "ground truth")
-            for piece in split_at_gaps(result.gt_timestamps_s, truth)
-        ]
+        true_paths = split_at_gaps(result.gt_timestamps_s, truth)
+        polylines += [Polyline(piece, style.TRUTH, 6.0, "ground truth") for piece in true_paths]
+    if result.gt_objects is not None:
+        true_paths += true_object_paths(result.gt_objects)
     if len(Ts):
         size_m = FRUSTUM_SHARE * extent_m(path, points)
         length_m = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
@@ -98,7 +107,10 @@ def build_scene(result: Result, *, keyframe_every: int | None = None) -> Scene:
         polylines += [Polyline(f, style.FRUSTUM, 1.0) for f in frustums(Ts[::step], size_m)]
     for piece in split_at_gaps(result.timestamps_s, path[: len(Ts)]):
         polylines.append(Polyline(piece, style.ESTIMATE, 2.4, "camera, estimated"))
-    return Scene(points, colors, path, tuple(polylines), up, _forward(Ts, up), tuple(tags))
+    forward = _forward(Ts, up)
+    return Scene(
+        points, colors, path, tuple(polylines), up, forward, tuple(tags), tuple(true_paths)
+    )
 
 
 def near_path(points_m: Array, path_m: Array) -> NDArray[np.bool_]:

@@ -1,27 +1,28 @@
-"""How things look: colours that colour-blind eyes can tell apart, type, and marks on images.
+"""How things look: colours, type, and marks on images. Objects' colours are `object_colors`'s.
 
-Owns the palette (Okabe and Ito 2008) and drawing of text. Colours are (R, G, B) uint8 values and
-images (H, W, 3) uint8 RGB, drawn on in place by the functions named `draw_`.
+Owns all other colours and the drawing of text. Colours are (R, G, B) uint8 values and images
+(H, W, 3) uint8 RGB, drawn on in place by the functions named `draw_`.
 """
 
 from __future__ import annotations
 
-import colorsys
 from functools import cache
 from typing import Any
 
 import numpy as np
 
+from pipelines import object_colors
+from pipelines.object_colors import Color
 from pipelines.types import Image
 
-Color = tuple[int, int, int]
+object_color = object_colors.object_color  # the same as in files
 
 WHITE: Color = (255, 255, 255)
 INK: Color = (38, 38, 42)
 GREY: Color = (150, 150, 150)
 
 ESTIMATE: Color = (0, 100, 190)  # blue: the camera as estimated
-TRUTH: Color = (245, 178, 66)  # amber, drawn wide beneath the estimate: the camera as it was
+TRUTH: Color = (116, 116, 124)  # grey, as no object is: what truly was, in every view
 FRUSTUM: Color = (90, 160, 220)
 START: Color = (0, 140, 100)
 END: Color = (170, 50, 120)
@@ -32,25 +33,13 @@ UNTRACKED: Color = (165, 165, 170)
 STATUS_OK: Color = (0, 135, 95)
 STATUS_LOST: Color = (205, 50, 30)
 
-OBJECT_COLORS: tuple[Color, ...] = (
-    (230, 159, 0),
-    (86, 180, 233),
-    (204, 121, 167),
-    (240, 228, 66),
-    (213, 94, 0),
-    (0, 158, 115),
-    (120, 110, 220),
-    (170, 220, 90),
-)
-# Past the palette's end its hues are taken again, turned, at these lightnesses in turn. The first
-# 64 differ the most of what was tried, and none is lost on a white or a dark ground.
-_TURN, _LIGHTNESSES, _FULLEST = 0.046, (0.42, 0.55, 0.62), 0.9
 BACKGROUNDS: dict[str, Color] = {"white": WHITE, "black": (16, 18, 22)}
 
 
 # Lighter kinds of the colours above that would not stand out from a dark ground.
 ON_DARK: dict[Color, Color] = {
     ESTIMATE: (90, 180, 255),
+    TRUTH: (172, 172, 180),
     START: (70, 215, 165),
     END: (240, 125, 195),
 }
@@ -70,20 +59,6 @@ def ink_on(color: Color) -> Color:
 def hex_color(color: Color) -> str:
     """The colour as "#rrggbb"."""
     return "#{:02x}{:02x}{:02x}".format(*color)
-
-
-def object_color(object_id: int) -> Color:
-    """The colour of an object, the same in every picture and run: it depends on its id alone."""
-    base = OBJECT_COLORS[(object_id - 1) % len(OBJECT_COLORS)]
-    turn = (object_id - 1) // len(OBJECT_COLORS)
-    if turn == 0:
-        return base
-    hue, _, saturation = colorsys.rgb_to_hls(*(channel / 255.0 for channel in base))
-    lightness = _LIGHTNESSES[(turn - 1) % len(_LIGHTNESSES)]
-    red, green, blue = colorsys.hls_to_rgb(
-        (hue + _TURN * turn) % 1.0, lightness, min(saturation, _FULLEST)
-    )
-    return round(255 * red), round(255 * green), round(255 * blue)
 
 
 @cache

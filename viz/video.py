@@ -16,7 +16,7 @@ from pipelines.io.result import Result
 from pipelines.types import Array, Image
 from viz import style
 from viz.chase import chase_views
-from viz.legend import draw_key_and_scale
+from viz.legend import draw_key_and_scale, draw_title
 from viz.moment import build_stage, draw_moment, draw_moment_labels
 from viz.moment_legend import draw_moment_title, moment_key
 from viz.mp4 import open_mp4
@@ -31,6 +31,7 @@ WIDTH_PX = 1280
 MOST_FRAME_SHARE = 0.47  # of the width: height of the frame in the widest video
 MAP_SHARE = 0.42  # of the width: height of the map below a frame
 ALONE_SHARE = 0.5625  # and of a map alone
+BOTH_HALVES = "after the global batch  (the picture above: as it was live)"
 LONGEST_S, ONLY_S = 2.0, 1.0  # a gap in the data is played so long; a run of one frame lasts this
 
 
@@ -80,6 +81,8 @@ def write_video(
             taken = draw_key_and_scale(picture, own, key, playback.scene, dark=dark)
             if not frame_px:
                 taken.append(draw_moment_title(picture, own, result, playback, k, dark=dark))
+            elif playback.is_optimised:
+                taken.append(draw_title(picture, own, [BOTH_HALVES], large=False, dark=dark))
             draw_moment_labels(picture, own, playback, k, taken)
             if frame_px:
                 picture = np.concatenate([frames.at(k, (size[0], frame_px)), picture])

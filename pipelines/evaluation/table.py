@@ -170,7 +170,8 @@ def batch_rows(metrics: dict[str, Any]) -> list[Row]:
     if not batch["accepted"]:
         rows.append(("Refused: the front-end's answers are kept", "", "", ""))
     elif kept:
-        rows.append((f"Refused for objects {', '.join(map(str, kept))}", "", "", ""))
+        what = "object" if len(kept) == 1 else "objects"
+        rows.append((f"Refused for {what} {', '.join(map(str, kept))}", "", "", ""))
     return rows
 
 

@@ -24,6 +24,7 @@ OBJECTS_GT_CSV = "objects_gt.csv"
 NOISE_GT = "noise_gt.json"
 OBJECTS = "objects"  # a folder: a trajectory an object
 STATIC_MAP = "static_map.ply"
+OBJECTS_MAP = "objects_map.ply"
 METRICS_JSON = "metrics.json"
 METRICS_TXT = "metrics.txt"
 TIMINGS = "timings.json"
@@ -73,7 +74,7 @@ def clear_result_folder(folder: Path | str, *, resume: bool = False) -> None:
     """
     folder = Path(folder)
     check_output(folder, LOG)
-    files = [CONFIG, CAMERA_TUM, CAMERA_KITTI, CAMERA_GT_TUM, STATIC_MAP]
+    files = [CONFIG, CAMERA_TUM, CAMERA_KITTI, CAMERA_GT_TUM, STATIC_MAP, OBJECTS_MAP]
     files += [OBJECTS_CSV, OBJECTS_GT_CSV, NOISE_GT, CAMERA_STD, SCENE, REPORT]
     stale = [folder / name for name in (*files, METRICS_JSON, METRICS_TXT, TIMINGS)]
     stale += (folder / OBJECTS).glob("*_tum.txt")

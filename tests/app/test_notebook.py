@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,6 +12,7 @@ import urllib.error
 import urllib.request
 from argparse import Namespace
 from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
@@ -33,6 +36,16 @@ def status(url: str) -> int:
             return int(answer.status)
     except urllib.error.HTTPError as error:
         return error.code
+
+
+def page_settings(url: str) -> dict[str, Any]:
+    """What the lab's page is told by its server."""
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    with opener.open(url, timeout=60) as answer:
+        page = answer.read().decode()
+    found = re.search(r'id="jupyter-config-data"[^>]*>(.*?)</script>', page, re.DOTALL)
+    assert found is not None, page[:500]
+    return dict(json.loads(found[1]))
 
 
 @pytest.mark.parametrize(
@@ -77,6 +90,9 @@ def test_the_address_that_it_prints_opens_and_ctrl_c_ends_it(tmp_path: Path) -> 
             parts = urlsplit(url)
             assert parts.hostname == "127.0.0.1" and len(parse_qs(parts.query)["token"][0]) > 20
             assert status(url) == 200
+            settings = page_settings(url)
+            assert not settings["buildCheck"] and not settings["buildAvailable"]
+            assert "@jupyterlab/apputils-extension:announcements" in settings["disabledExtensions"]
             contents = f"http://{parts.netloc}/api/contents/notebooks"
             assert status(contents) == 403
             assert status(f"{contents}?{parts.query}") == 200

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import signal
@@ -10,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -52,7 +54,24 @@ def test_run_counts_what_it_did(result: Path) -> None:
 
 def test_run_annotates_each_frame(result: Path) -> None:
     names = [file.name for file in sorted((result / "frames").iterdir())]
-    assert names == [f"{index:06d}.png" for index in range(N_FRAMES)]
+    assert names == [f"{index:06d}.jpg" for index in range(N_FRAMES)]
+
+
+def test_run_leaves_its_objects_as_points(result: Path) -> None:
+    """After its batch too; they are where boxes of the objects were, in the colours of ids."""
+    from pipelines.io.ply import read_point_cloud
+    from pipelines.object_colors import object_color
+
+    points_m, colors = read_point_cloud(result / "objects_map.ply")
+    with (result / "objects.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["center_x_m"] and row["L_tx_m"]]
+    ids = {int(row["object_id"]) for row in rows}
+    assert len(points_m) > 200
+    assert {tuple(color) for color in colors.tolist()} <= {object_color(j) for j in ids}
+    best = max(rows, key=lambda row: int(row["n_points"]))
+    own = points_m[(colors == object_color(int(best["object_id"]))).all(1)]
+    center = [float(best[f"center_{axis}_m"]) for axis in "xyz"]
+    assert np.linalg.norm(np.median(own, axis=0) - center) < 2.0
 
 
 def test_eval_restores_metrics_that_were_lost(result: Path) -> None:

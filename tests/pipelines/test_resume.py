@@ -211,7 +211,7 @@ def test_pictures_go_on_where_they_were(street, tmp_path) -> None:
     run(street, config, folder, frames=8, sinks=[FrameWriter(every=3), Interrupter(4)])
     run(street, config, folder, frames=8, sinks=[FrameWriter(every=3)], resume=True)
     names = sorted(path.name for path in (folder / "frames").iterdir())
-    assert names == ["000000.png", "000003.png", "000006.png"]
+    assert names == ["000000.jpg", "000003.jpg", "000006.jpg"]
 
 
 def loop_of(slam: DyObSlam) -> LoopClosure:

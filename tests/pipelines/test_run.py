@@ -21,7 +21,13 @@ from pipelines.io.trajectory import read_tum
 from pipelines.runner import run
 from pipelines.types import Frame, FrameResult, TrackingStatus
 
-ESTIMATES = ("camera_tum.txt", "camera_kitti.txt", "objects.csv", "static_map.ply")
+ESTIMATES = (
+    "camera_tum.txt",
+    "camera_kitti.txt",
+    "objects.csv",
+    "static_map.ply",
+    "objects_map.ply",
+)
 FILES = {
     *ESTIMATES,
     "config.yaml",

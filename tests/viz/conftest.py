@@ -1,17 +1,31 @@
-"""A short run whose camera follows a car, with annotated frames, for what shows runs."""
+"""A short run whose camera follows a car, for what shows runs, and a browser to look at pages."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from app.system_libraries import browser as find_browser
 from pipelines.geometry import exp_se3, make_T
 from pipelines.io.result import Result
 from pipelines.object_types import ObjectEstimates
 
+BROWSER_FLAGS = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
 N = 8
 STEP = exp_se3(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.8]))  # of the car a frame, along z
 
@@ -50,3 +64,16 @@ def short_run(tmp_path: Path) -> Result:
         tmp_path, stamps, Ts, None, None, points, np.full(points.shape, 90, np.uint8),
         timings=timings, objects=car_ahead(),
     )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium without a display. For a module alone: playwright's loop would disturb others."""
+    program = find_browser()
+    if program is None:
+        pytest.skip("needs chromium, which is not there: apt-get install chromium")
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    with playwright.sync_playwright() as running:
+        chromium = running.chromium.launch(executable_path=program, args=BROWSER_FLAGS)
+        yield chromium
+        chromium.close()

@@ -7,11 +7,13 @@ import numpy as np
 
 from pipelines.io.result import Result
 from pipelines.object_types import ObjectEstimates
+from pipelines.types import ObjectTruth
 from viz import style
+from viz.lines import draw_polyline
 from viz.object_marks import overlaps
-from viz.object_paths import object_paths
+from viz.object_paths import object_paths, true_object_paths
 from viz.scene import build_scene
-from viz.tags import draw_tags
+from viz.tags import draw_ends, draw_tags
 from viz.views import choose_view
 
 SIZE = (1280, 720)
@@ -89,3 +91,35 @@ def test_tags_are_drawn_beside_discs_and_never_over_each_other():
     assert (blocked.astype(int).sum(2) < 250).sum() < 0.1 * dark
     assert overlaps((0, 0, 2, 2), [(1, 1, 3, 3)])
     assert not overlaps((0, 0, 2, 2), [(2, 0, 3, 2)])
+
+
+def test_true_objects_that_move_have_paths_with_gaps():
+    hidden = line(20, 3.0)
+    hidden[8:12] = np.nan
+    index, ids = np.tile(np.arange(20), 2), np.repeat([4, 9], 20)
+    T = np.tile(np.eye(4), (40, 1, 1))
+    T[:, :3, 3] = np.concatenate([hidden, line(20, 5.0)])
+    moving = (ids == 4) & (index > 14)  # it stood at first; 9 stands all the time
+    truth = ObjectTruth(index, ids, np.full(40, "car"), T, np.full((40, 4), np.nan), moving)
+    before, after = true_object_paths(truth)
+    np.testing.assert_array_equal(before, hidden[:8])
+    np.testing.assert_array_equal(after, hidden[12:])
+
+
+def test_words_at_the_ends_of_the_path_hide_no_other_path():
+    """They stand below, but above where a car drives close below the camera."""
+    for sides, is_above in (((1.2,), True), ((-5.0,), False)):
+        result = make_result(make_objects({j + 1: line(40, x) for j, x in enumerate(sides)}))
+        scene = build_scene(result)
+        view = choose_view("top", scene, SIZE)
+        picture = np.full((SIZE[1], SIZE[0], 3), 255, np.uint8)
+        for path in scene.polylines:
+            draw_polyline(picture, view, path)
+        bare = picture.copy()
+        taken = draw_ends(picture, view, scene, [])
+        v_end = view.project(scene.path_m[-1:])[0][0, 1]
+        end, start = taken[2:]
+        assert (end[3] < v_end, start[3] < v_end) == (is_above, is_above)
+        for j in range(len(sides)):
+            of_car = (bare == style.object_color(j + 1)).all(2)
+            assert of_car.any() and (picture[of_car] == style.object_color(j + 1)).all()

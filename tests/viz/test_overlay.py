@@ -104,9 +104,11 @@ def test_writer_writes_every_nth(tmp_path):
         writer.frame(make_frame(k), make_result(k))
     writer.finish()
     files = sorted(path.name for path in (tmp_path / "frames").iterdir())
-    assert files == [f"{k:06d}.png" for k in range(0, 50, 2)]
-    read = cv2.imread(str(tmp_path / "frames" / "000010.png"))[..., ::-1]
-    np.testing.assert_array_equal(read, draw_frame(make_frame(10), make_result(10)))
+    assert files == [f"{k:06d}.jpg" for k in range(0, 50, 2)]
+    read = cv2.imread(str(tmp_path / "frames" / "000010.jpg"))[..., ::-1].astype(float)
+    drawn = draw_frame(make_frame(10), make_result(10))
+    assert np.abs(read - drawn).mean() < 0.5
+    assert np.abs(read - drawn).max() < 60  # of thin marks; with halved colours it is more
 
 
 def test_every_nth_is_counted_among_the_frames_of_the_run(tmp_path):
@@ -116,8 +118,8 @@ def test_every_nth_is_counted_among_the_frames_of_the_run(tmp_path):
         writer.frame(make_frame(k), make_result(k))
     writer.finish()
     assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == [
-        "000001.png",
-        "000007.png",
+        "000001.jpg",
+        "000007.jpg",
     ]
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import viz.report
-from app import system_libraries
 from pipelines.config import Config, config_to_dict
 from pipelines.evaluation import evaluate_result
 from pipelines.geometry import exp_se3, make_T
@@ -33,18 +32,6 @@ from viz.report_objects import summarise_objects
 
 N = 12
 STEP = exp_se3(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))  # of the car: 36 km/h at 10 frames/s
-CHROMIUM = system_libraries.browser()
-FLAGS = [
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
 
 
 def two_objects() -> ObjectEstimates:
@@ -199,6 +186,14 @@ def test_a_scene_too_large_for_the_page_lies_beside_it(tmp_path, scene, monkeypa
     assert not (folder / "scene.html").exists() and not (folder / "report.html").exists()
 
 
+def test_frames_of_before_the_batch_are_said_to_be_so(tmp_path, scene):
+    folder = write(tmp_path / "result")
+    assert "known live" not in words(write_report(load_result(folder)).read_text())
+    metrics = load_result(folder).metrics
+    ResultWriter(folder).write_metrics({**metrics, "batch": {"accepted": True}}, "")
+    assert "known live" in words(write_report(load_result(folder)).read_text())
+
+
 def test_an_object_is_summed_up(tmp_path):
     result = load_result(write(tmp_path / "result"))
     car, parked = summarise_objects(result, build_playback(result))
@@ -209,35 +204,29 @@ def test_an_object_is_summed_up(tmp_path):
     assert car.way_m == pytest.approx(11.0, abs=1e-3) and parked.way_m == 0.0
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium to open the page")
-def test_a_browser_shows_it_on_a_desk_and_on_a_phone(tmp_path):
+def test_a_browser_shows_it_on_a_desk_and_on_a_phone(tmp_path, browser):
     """With the scene itself inside: no error, nothing asked of the network, nothing cut off."""
-    from playwright.sync_api import sync_playwright
-
     folder = write(tmp_path / "result")
     plot_result(folder)
     path = write_report(load_result(folder))
     said, asked = [], []
-    with sync_playwright() as drivers:
-        browser = drivers.chromium.launch_persistent_context(
-            tmp_path / "profile", executable_path=CHROMIUM, args=FLAGS
-        )
-        page = browser.new_page()
-        page.on("console", lambda message: said.append((message.type, message.text)))
-        page.on("pageerror", lambda error: said.append(("error", str(error))))
-        page.on("request", lambda request: asked.append(request.url))
-        for width in (1280, 390):
-            page.set_viewport_size({"width": width, "height": 900})
-            page.goto(path.as_uri())
-            page.wait_for_timeout(500)
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
-        backgrounds = []
-        for scheme in ("light", "dark"):
-            page.emulate_media(color_scheme=scheme)
-            backgrounds.append(page.evaluate("getComputedStyle(document.body).backgroundColor"))
-        page.emulate_media(media="print")
-        assert not page.locator(".scene").is_visible()
-        browser.close()
+    context = browser.new_context()
+    page = context.new_page()
+    page.on("console", lambda message: said.append((message.type, message.text)))
+    page.on("pageerror", lambda error: said.append(("error", str(error))))
+    page.on("request", lambda request: asked.append(request.url))
+    for width in (1280, 390):
+        page.set_viewport_size({"width": width, "height": 900})
+        page.goto(path.as_uri())
+        page.wait_for_timeout(500)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+    backgrounds = []
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme=scheme)
+        backgrounds.append(page.evaluate("getComputedStyle(document.body).backgroundColor"))
+    page.emulate_media(media="print")
+    assert not page.locator(".scene").is_visible()
+    context.close()
     assert not [text for kind, text in said if kind == "error"]
     assert {url for url in asked if not url.startswith(("data:", "blob:", "about:"))} == {
         path.as_uri()

@@ -49,6 +49,19 @@ def test_frames_above_and_map_below(short_run, tmp_path):
     assert path.read_bytes().index(b"moov") < path.read_bytes().index(b"mdat")  # plays at once
 
 
+def test_halves_of_before_and_after_the_batch_say_so(short_run, tmp_path):
+    """In words at the map's top left, where else nothing is; not where both are the same."""
+    pictures = {}
+    for is_optimised in (False, True):
+        run = replace(short_run, metrics={"batch": {"accepted": is_optimised}})
+        pictures[is_optimised], _ = decode(write_video(run, tmp_path / "run.mp4", width=640))
+    differs = np.abs(pictures[True].astype(int) - pictures[False]).max(3) > 60
+    frame_px = round(64 / 201 * 640 / 2) * 2
+    for k in range(8):
+        v, u = np.nonzero(differs[k])
+        assert len(v) > 100 and v.min() >= frame_px and v.max() < frame_px + 60 and u.min() < 60
+
+
 def test_without_annotated_frames_the_map_fills_the_video(short_run, tmp_path, caplog):
     shutil.rmtree(tmp_path / "frames")
     pictures, _ = decode(write_video(short_run, tmp_path / "run.mp4", width=320))
@@ -118,26 +131,18 @@ def test_what_cannot_be_made_is_said(short_run, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_browser_plays_it(short_run, tmp_path):
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("needs chromium (Debian: apt-get install chromium)")
-    from playwright.sync_api import sync_playwright
-
+def test_a_browser_plays_it(short_run, tmp_path, browser):
     write_video(short_run, tmp_path / "run.mp4", width=320)
     page_file = tmp_path / "page.html"
     page_file.write_text("<video src='run.mp4' muted loop></video>")
-    flags = "--no-sandbox --disable-quic --no-first-run --disable-background-networking"
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=flags.split())
-        page = browser.new_page()
-        page.goto(page_file.as_uri())
-        page.evaluate("document.querySelector('video').play()")
-        page.wait_for_function("document.querySelector('video').currentTime > 0.2")
-        state = page.evaluate(
-            "(v => [v.readyState, v.videoWidth, v.duration, v.error])"
-            "(document.querySelector('video'))"
-        )
-        browser.close()
+    context = browser.new_context()
+    page = context.new_page()
+    page.goto(page_file.as_uri())
+    page.evaluate("document.querySelector('video').play()")
+    page.wait_for_function("document.querySelector('video').currentTime > 0.2")
+    state = page.evaluate(
+        "(v => [v.readyState, v.videoWidth, v.duration, v.error])(document.querySelector('video'))"
+    )
+    context.close()
     assert state[0] >= 2 and state[1] == 320 and state[3] is None
     assert state[2] == pytest.approx(0.8, abs=0.02)

@@ -55,7 +55,7 @@ class LiveServer(PageServer):
         self._loop.call_soon_threadsafe(self._take_map, facts, _MAP + cloud.message)
 
     def tell_picture(self, k: int, jpeg: bytes) -> None:
-        """The annotated frame at a position; a browser that lags behind is spared it."""
+        """The annotated frame at a position; one that lags behind gets the newest when it can."""
         self._loop.call_soon_threadsafe(self._take_picture, struct.pack("<i", k) + jpeg)
 
     # ---- in the server's thread
@@ -99,20 +99,16 @@ class LiveServer(PageServer):
             browser.close()
 
     def rules(self) -> Rules:
-        from tornado.web import RequestHandler
         from tornado.websocket import WebSocketClosedError, WebSocketHandler
-
-        @guarded
-        class Page(RequestHandler):
-            def get(self) -> None:
-                self.finish(self.server.page)
 
         @guarded
         class Live(WebSocketHandler):
             """One browser. tornado lets in pages of this very origin alone."""
 
+            writing = 0  # messages that are under way
+            owed: bytes | None = None  # the newest picture, which came meanwhile
+
             def open(self) -> None:
-                self.writing = 0
                 self.server._welcome(self)
 
             def say(self, message: str | bytes) -> None:
@@ -128,12 +124,17 @@ class LiveServer(PageServer):
                 self.writing -= 1
                 if not sent.cancelled():
                     sent.exception()  # of a browser that was closed meanwhile
+                if self.owed is not None and self.writing == 0:
+                    picture, self.owed = self.owed, None
+                    self.say(picture)
 
             def show(self, picture: bytes) -> None:
                 if self.writing == 0:
                     self.say(picture)
+                else:
+                    self.owed = picture
 
             def on_close(self) -> None:
                 self.server._browsers.discard(self)
 
-        return [(r"/", Page, {"server": self}), (r"/live", Live, {"server": self})]
+        return [*super().rules(), (r"/live", Live, {"server": self})]

@@ -15,6 +15,7 @@ from typing import Any
 _PARTS = Path(__file__).parent / "page"
 _SCRIPTS = ("lines", "frames", "world", "views", "labels", "sources", "player", "main")
 _LAYERS = ("map", "camera", "objects", "trails", "labels", "truth", "image")
+_HIDDEN = ("truth",)  # layers that a person has to ask for
 _ICONS = {
     "first": '<path d="M1 2h2v12H1zM14 2v12L4 8z"/>',
     "back": '<path d="M12 2v12L3 8z"/>',
@@ -69,7 +70,8 @@ def _icon(name: str, shape: str) -> str:
 
 
 def _layer(name: str) -> str:
-    box = f'<input type="checkbox" id="show-{name}" data-layer="{name}" checked>'
+    checked = "" if name in _HIDDEN else " checked"
+    box = f'<input type="checkbox" id="show-{name}" data-layer="{name}"{checked}>'
     return f'<label id="layer-{name}">{box}{name}</label>'
 
 

@@ -44,11 +44,6 @@ class RecordedServer(PageServer):
         from tornado.web import HTTPError, RequestHandler
 
         @guarded
-        class Page(RequestHandler):
-            def get(self) -> None:
-                self.finish(self.server.page)
-
-        @guarded
         class Data(RequestHandler):
             def get(self) -> None:
                 self.set_header("Content-Type", "application/json")
@@ -75,7 +70,7 @@ class RecordedServer(PageServer):
 
         own = {"server": self}
         return [
-            (r"/", Page, own),
+            *super().rules(),
             (r"/data", Data, own),
             (r"/map", Map, own),
             (r"/picture/(\d{1,9})", Picture, own),

@@ -17,7 +17,6 @@ from viz.object_paths import OBJECT_GAP_S
 from viz.playback import Playback
 from viz.scene import Scene
 
-TRUTH_LABEL = "ground truth"  # of the polylines of a scene
 THEMES = ("dark", "light")
 _APERTURE = {"left": -0.6, "right": 0.6, "top": -0.4, "bottom": 0.4}  # where none is known
 _MM = 3  # decimals of lengths in m; directions get two more
@@ -30,8 +29,11 @@ def page_setup(
     *,
     theme: str = "dark",
     notes: Sequence[str] = (),
+    picture_note: str = "",
 ) -> dict[str, Any]:
     """All that holds for the whole run. scene: None for a run that has just begun.
+
+    notes: words below the title. picture_note: words below each annotated frame.
 
     Raises ValueError for an unknown theme.
     """
@@ -39,7 +41,7 @@ def page_setup(
         raise ValueError(f"page_setup: expected theme {' or '.join(THEMES)}, found '{theme}'")
     up = np.array([0.0, -1.0, 0.0]) if scene is None else scene.up
     forward = np.array([0.0, 0.0, 1.0]) if scene is None else scene.forward
-    lines = () if scene is None else scene.polylines
+    true_paths = () if scene is None else scene.true_paths
     return {
         "title": title,
         "live": scene is None,
@@ -47,13 +49,17 @@ def page_setup(
         "up": _rounded(up, 6),
         "forward": _rounded(forward, 6),
         "camera": _aperture(camera),
-        "truth": [_rows(line.points_m) for line in lines if line.label == TRUTH_LABEL],
+        "truth": [_rows(path) for path in true_paths],
         "trail_gap_s": OBJECT_GAP_S,
         "palette": {
             "frustum": style.hex_color(style.FRUSTUM),
-            "truth": style.hex_color(style.TRUTH),
+            "truth": {
+                "light": style.hex_color(style.TRUTH),
+                "dark": style.hex_color(style.on_dark(style.TRUTH)),
+            },
         },
         "notes": list(notes),
+        "picture_note": picture_note,
     }
 
 

@@ -18,6 +18,7 @@ from viz.browser.records import page_setup, playback_records
 from viz.playback import Playback, build_playback
 
 MB = 1e6
+PICTURE_NOTE = "as it was live, before the global batch"
 _BYTES_A_POINT = 15 * 4 / 3  # position and colour, in base64
 _SHARE_OF_POINTS = 0.3  # of the page, at most
 
@@ -61,7 +62,14 @@ def page_data(
     title = str(result.metrics.get("run", {}).get("sequence", result.folder.name))
     notes = ["the map is thinned"] if cloud.n_points < cloud.n_all else []
     data = {
-        "setup": page_setup(title, scene, playback.camera, theme=theme, notes=notes),
+        "setup": page_setup(
+            title,
+            scene,
+            playback.camera,
+            theme=theme,
+            notes=notes,
+            picture_note=PICTURE_NOTE if playback.is_optimised else "",
+        ),
         "map": cloud.facts,
         "frames": playback_records(playback),
     }

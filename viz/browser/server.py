@@ -32,6 +32,8 @@ class PageServer:
     first free one from 7000 on.
     """
 
+    page = ""  # HTML that heirs put in
+
     def __init__(self, host: str | None = None, port: int | None = None) -> None:
         self.host = host or LOOPBACK
         self.token = "" if _is_loopback(self.host) else secrets.token_urlsafe(24)
@@ -61,8 +63,15 @@ class PageServer:
             self._thread.join(_STOP_S)
 
     def rules(self) -> Rules:
-        """The handlers' rules, as tornado takes them; for heirs to fill."""
-        raise NotImplementedError
+        """The handlers' rules, as tornado takes them: the page at the root; heirs add theirs."""
+        from tornado.web import RequestHandler
+
+        @guarded
+        class Page(RequestHandler):
+            def get(self) -> None:
+                self.finish(self.server.page)
+
+        return [(r"/", Page, {"server": self})]
 
     async def last_words(self) -> None:
         """What is still to be sent at the end; for heirs."""

@@ -11,7 +11,7 @@ import pytest
 from pipelines.geometry import exp_se3, make_T
 from pipelines.io.result import Result
 from pipelines.object_types import ObjectEstimates
-from pipelines.types import StereoCamera
+from pipelines.types import ObjectTruth, StereoCamera
 
 N_FRAMES = 8
 STEP = exp_se3(np.array([0.0, 0.02, 0.0, 0.1, 0.0, 0.8]))  # of the car a frame, in the world
@@ -60,7 +60,14 @@ def result(tmp_path_factory, objects) -> Result:
         "frames_index": list(range(N_FRAMES)),
         "frames_timestamp_s": stamps.tolist(),
     }
+    drives = objects.object_id == 3
+    poses = objects.Ts_world_object.copy()
+    poses[:, 0, 3] += np.where(drives, 1.5, 0.0)  # the true car drives beside the estimated one
+    truth = ObjectTruth(
+        objects.frame_index, objects.object_id, objects.class_name, poses, objects.boxes_px, drives
+    )
+    metrics = {"run": {"sequence": "a <b>road</b>"}, "batch": {"accepted": True}}
     return Result(
         folder, stamps, Ts, stamps, Ts + 0.01, points, np.full((600, 3), 140, np.uint8),
-        metrics={"run": {"sequence": "a <b>road</b>"}}, timings=timings, objects=objects,
+        metrics=metrics, timings=timings, objects=objects, gt_objects=truth,
     )  # fmt: skip

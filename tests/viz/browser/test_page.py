@@ -12,24 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from app.system_libraries import browser as find_browser
 from pipelines.config import Config
 from pipelines.types import Frame, FrameResult, MotionHypothesis, TrackingStatus
 from viz.browser import export_scene
 from viz.browser.live import LiveViewer
 from viz.browser.recorded import RecordedServer
 
-FLAGS = [
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
 SIZE = {"width": 900, "height": 560}
 WAIT_S = 40.0
 
@@ -81,19 +69,6 @@ class Visit:
             f"(() => {{ const s = document.getElementById('slider'); s.value = {k}; "
             "s.dispatchEvent(new Event('input')); })()"
         )
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Chromium without a display. For this module alone: playwright's loop would disturb others."""
-    program = find_browser()
-    if program is None:
-        pytest.skip("needs chromium, which is not there: apt-get install chromium")
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
-    with playwright.sync_playwright() as running:
-        browser = running.chromium.launch(executable_path=program, args=FLAGS)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +134,48 @@ def test_layers_are_hidden_and_shown(scene):
         assert np.abs(whole.astype(float) - less).max() > 60, layer
         scene.page.click(f"#show-{layer}")
     assert np.abs(whole.astype(float) - scene.picture()).mean() < 0.5
+
+
+def test_the_truth_is_hidden_until_it_is_asked_for(scene):
+    scene.ask("dyob.view('top')")
+    scene.slide_to(7)
+    assert not scene.page.is_checked("#show-truth")
+    without = scene.picture().astype(float)
+    scene.page.click("#show-truth")
+    shown = np.abs(scene.picture() - without).max(2) > 40
+    scene.page.click("#show-truth")
+    assert np.abs(scene.picture() - without).mean() < 0.5
+    # The true car's way is a line of grey 1.5 m beside the estimated one, along all of it.
+    car = [scene.ask(f"(dyob.seek({k}), dyob.boxes().find((b) => b.id === 3))") for k in (0, 7)]
+    for place in car:
+        x, y, z = place["position"]
+        beside = f"new MeshCat.THREE.Vector3({x + 1.5}, {y}, {z})"
+        u, v, _ = scene.ask(f"dyob.player.labels.project({beside})")
+        assert around(shown, [u, v]).any()
+    assert len(scene.ask("dyob.player.about.truth")) == 2  # the camera, and what moves
+
+
+def test_from_above_what_is_ahead_is_to_the_right(scene):
+    scene.ask("dyob.view('top')")
+    scene.ask("dyob.seek(0)")
+    before, parked = scene.box(3)["pixel"], scene.box(5)["pixel"]
+    scene.ask("dyob.seek(7)")
+    after = scene.box(3)["pixel"]
+    assert after[0] > before[0] + 40
+    assert parked[1] < before[1]  # it is at the left of the street
+    scene.page.set_viewport_size({"width": 390, "height": 760})
+    scene.until("dyob.player.viewer.camera.aspect < 1")
+    scene.ask("dyob.view('top')")
+    assert scene.box(3)["pixel"][1] < scene.box(5)["pixel"][1]  # on a phone, ahead is upward
+    head, picture = (scene.page.locator(name).bounding_box() for name in ("#head", "#picture"))
+    assert head["y"] + head["height"] <= picture["y"]
+    scene.page.set_viewport_size(SIZE)
+    scene.until("dyob.player.viewer.camera.aspect > 1")
+
+
+def test_a_picture_of_before_the_batch_says_so(scene):
+    scene.slide_to(2)
+    assert "before the global batch" in scene.page.inner_text("#caption")
 
 
 def test_keys_step_and_play_goes_on_by_itself(scene):

@@ -7,6 +7,7 @@ import socket
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from concurrent.futures import Future
 
 import numpy as np
 import pytest
@@ -125,6 +126,23 @@ def test_a_live_view_is_guarded_as_well(live):
         assert " 403 " in knock(live, path, origin)
     assert fetch(f"{own}/")[0] == 403
     assert fetch(live.url.replace("0.0.0.0", "127.0.0.1").split("?")[0])[0] == 403
+
+
+def test_a_browser_that_lags_gets_the_newest_picture_alone(live):
+    """Else the last one of a run might never come."""
+    (handler,) = (rule[1] for rule in live.rules() if rule[0] == "/live")
+    browser, said = handler.__new__(handler), []
+    browser.say = said.append
+    browser.writing = 1
+    browser.show(b"first")
+    browser.show(b"second")
+    assert said == []
+    sent: Future[None] = Future()
+    sent.set_result(None)
+    browser._said(sent)
+    assert said == [b"second"]
+    browser.show(b"third")
+    assert said == [b"second", b"third"] and browser.owed is None
 
 
 def test_each_run_has_a_token_of_its_own(shared, live):

@@ -172,7 +172,8 @@ class Player {
     byId("layer-image").hidden = !address;
     if (address && byId("frame").getAttribute("src") !== address) byId("frame").src = address;
     const late = address && this.k - k > 2;
-    byId("caption").textContent = late ? `picture of frame ${this.frames.list[k].index}` : "";
+    const notes = [late && `picture of frame ${this.frames.list[k].index}`, this.about.picture_note];
+    byId("caption").textContent = notes.filter((note) => note).join(", ");
     if (had !== figure.hidden) this.layout();
   }
 

@@ -74,16 +74,18 @@ class Views {
     const { camera, controls } = this.viewer, box = this.span();
     const size = box.getSize(new MeshCat.THREE.Vector3());
     this.lens(25);
-    const turned = size.z > 1.2 * size.x; // then its length lies along the screen's width
+    const upright = camera.aspect < 1; // a phone's screen, whose upper part the picture takes
+    // The map's length lies along the screen's; turned, what is ahead is to the right.
+    const turned = upright ? size.x > 1.2 * size.z : size.z > 1.2 * size.x;
     const [wide, deep] = turned ? [size.z, size.x] : [size.x, size.z];
     const half = Math.tan((camera.fov * Math.PI) / 360);
-    const room = 0.76; // of the screen's height: the rest is taken by the controls
+    const room = upright ? 0.48 : 0.76; // of the screen's height: the rest is taken by the controls
     const away = 0.5 * Math.max(deep / room, wide / (0.96 * camera.aspect)) / half + size.y;
     box.getCenter(controls.target);
     const tilt = 1e-3 * away; // a view straight down has no upright
     camera.position.copy(controls.target);
-    camera.position.add(new MeshCat.THREE.Vector3(turned ? -tilt : 0, away, turned ? 0 : tilt));
-    const down = (0.12 * 2 * half * away) / 2; // the middle of what the controls leave free
+    camera.position.add(new MeshCat.THREE.Vector3(turned ? tilt : 0, away, turned ? 0 : tilt));
+    const down = upright ? 0 : 0.12 * half * away; // the middle of what the controls leave free
     const shift = turned ? [down, 0, 0] : [0, 0, down];
     camera.position.add(new MeshCat.THREE.Vector3(...shift));
     controls.target.add(new MeshCat.THREE.Vector3(...shift));

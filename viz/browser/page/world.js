@@ -41,7 +41,7 @@ class World {
     this.boxes = new Map();
     this.trails = new Map();
     this.facts = { scale_m: 10, ground_m: -1.5, extent_m: [] };
-    this.layers = { map: true, camera: true, objects: true, trails: true, truth: true };
+    this.layers = { map: true, camera: true, objects: true, trails: true, truth: false };
     viewer.gui.domElement.style.display = "none";
     for (const name of ["Axes", "Grid"]) viewer.set_property([name], "visible", false);
     this.points = this.pointMaterial();
@@ -59,7 +59,8 @@ class World {
     this.aperture = camera;
     this.path = this.put(["camera", "path"], new FatLines("#5ab4ff", 3));
     this.frustum = this.put(["camera", "frustum"], new FatLines(palette.frustum, 2));
-    this.truth = this.put(["truth"], new FatLines(palette.truth, 2.2, { dash: 7 }));
+    this.truth = this.put(["truth"], new FatLines(palette.truth.dark, 1.8, { dash: 7 }));
+    this.truthColors = palette.truth;
     const pieces = truth.flatMap((line) => line.slice(1).map(
       (to, n) => ({ k: 0, from: new THREE.Vector3(...line[n]), to: new THREE.Vector3(...to) })));
     this.truth.setSegments(flat(pieces));
@@ -226,6 +227,7 @@ class World {
     this.points.uniforms.shade.value = theme.shade;
     if (this.grid) this.grid.setLook({ color: theme.grid, opacity: 0.55 });
     if (this.path) this.path.setLook({ color: theme.path });
+    if (this.truth) this.truth.setLook({ color: this.truthColors[name], dash: 7 });
     this.viewer.set_dirty();
   }
 
