@@ -302,8 +302,8 @@ class BatchConfig:
     with_objects: bool = True  # false: cameras and static points alone
     rounds: int = 2  # solutions, each without the outliers of the one before
     max_steps: int = 5  # of Levenberg-Marquardt in a round
-    acceleration_mps2: float = 1.0  # m/s^2, standard deviation of the change of a speed
-    turn_radps2: float = 0.2  # rad/s^2, and of the change of a turn
+    acceleration_mps2: float = 0.5  # m/s^2, standard deviation of the change of a speed
+    turn_radps2: float = 0.1  # rad/s^2, and of the change of a turn
     planar_sigma: float = 0.0  # tilt and lift of road vehicles as a share of their way, 0 = free
     held_out_share: float = 0.1  # of the sightings, which judge whether the batch is believed
     guard: bool = True  # refuse what these show to be worse; false: for comparisons

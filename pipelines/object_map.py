@@ -61,28 +61,22 @@ def object_points(
     timestamps_s (F,), Ts_world_camera (F, 4, 4): of the tracked frames.
     """
     seen = Sightings.concatenate(*(entry.sightings for entry in log))
-    seen = seen[seen.object_id != STATIC]
-    camera_of = _cameras(log, timestamps_s, Ts_world_camera)
+    frames, Xs = _cameras(log, timestamps_s, Ts_world_camera)
     known = np.isfinite(objects.Ts_world_object).all((1, 2))
     known &= np.isin(objects.state, [str(state) for state in _MEASURED])
-    row_of = {
-        (int(objects.object_id[row]), int(objects.frame_index[row])): row
-        for row in np.flatnonzero(known).tolist()
-    }
-    last_row = {object_id: row for (object_id, _), row in row_of.items()}
-    last_seen: dict[tuple[int, int], int] = {}
-    for n, (object_id, track_id, frame) in enumerate(
-        zip(seen.object_id.tolist(), seen.track_id.tolist(), seen.frame_index.tolist(), strict=True)
-    ):
-        if (object_id, frame) in row_of and frame in camera_of:
-            last_seen[object_id, track_id] = n
-    chosen = np.array(list(last_seen.values()), np.int64)
-    seen = seen[chosen]
-    pairs = list(zip(seen.object_id.tolist(), seen.frame_index.tolist(), strict=True))
-    rows = np.array([row_of[pair] for pair in pairs], np.int64)
-    last_rows = np.array([last_row[j] for j, _ in pairs], np.int64)
-    Xs = np.array([camera_of[frame] for _, frame in pairs]).reshape(-1, 4, 4)
-    on_object = _moved(invert_T(objects.Ts_world_object[rows]) @ Xs, seen.position_m)
+    rows = np.flatnonzero(known)
+    row_of = _RowsByFrame(objects.object_id[rows], objects.frame_index[rows])
+    at, at_frame = row_of.find(seen.object_id, seen.frame_index), _find(frames, seen.frame_index)
+    usable = np.flatnonzero((seen.object_id != STATIC) & (at >= 0) & (at_frame >= 0))
+    # Of each point's sightings the last, as the log goes by frames
+    point = np.column_stack([seen.object_id[usable], seen.track_id[usable]])[::-1]
+    _, last = np.unique(point, axis=0, return_index=True)
+    chosen = usable[::-1][last]
+    seen, Xs, at = seen[chosen], Xs[at_frame[chosen]], rows[at[chosen]]
+    _, last_of_object = np.unique(objects.object_id[rows][::-1], return_index=True)
+    last_rows = rows[::-1][last_of_object]
+    last_rows = last_rows[np.searchsorted(objects.object_id[last_rows], seen.object_id)]
+    on_object = _moved(invert_T(objects.Ts_world_object[at]) @ Xs, seen.position_m)
     last_Ls = objects.Ts_world_object[last_rows]
     centers = _moved(invert_T(last_Ls), objects.centers_m[last_rows])
     reach = 0.5 * _MARGIN * objects.extents_m[last_rows]
@@ -97,11 +91,37 @@ def _moved(Ts: Array, points_m: Array) -> Array:
 
 def _cameras(
     log: Sequence[FrameObservations], timestamps_s: Array, Ts_world_camera: Array
-) -> dict[int, Array]:
-    """Frame index -> T_world_camera (4, 4) of the tracked frames of the log."""
-    cameras = {}
-    for entry in log:
-        row = int(np.searchsorted(timestamps_s, entry.timestamp_s - _SAME_S))
-        if row < len(timestamps_s) and abs(timestamps_s[row] - entry.timestamp_s) < _SAME_S:
-            cameras[entry.frame_index] = Ts_world_camera[row]
-    return cameras
+) -> tuple[NDArray[np.int64], Array]:
+    """Frame indices (F,), ascending, and T_world_camera (F, 4, 4) of the log's tracked frames."""
+    times = np.array([entry.timestamp_s for entry in log])
+    frames = np.array([entry.frame_index for entry in log], np.int64)
+    row = np.searchsorted(timestamps_s, times - _SAME_S)
+    row = np.minimum(row, len(timestamps_s) - 1)
+    tracked = np.abs(timestamps_s[row] - times) < _SAME_S if len(timestamps_s) else row >= 0
+    return frames[tracked], Ts_world_camera[row[tracked]]
+
+
+class _RowsByFrame:
+    """Finds the row of an object in a frame."""
+
+    def __init__(self, object_id: NDArray[np.int64], frame_index: NDArray[np.int64]) -> None:
+        self._stride = int(frame_index.max(initial=0)) + 1
+        key = object_id * self._stride + frame_index
+        self._order = np.argsort(key, kind="stable")
+        self._key = key[self._order]
+
+    def find(
+        self, object_id: NDArray[np.int64], frame_index: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """(N,) rows, -1 where there is none."""
+        at = _find(self._key, object_id * self._stride + frame_index)
+        at[(frame_index < 0) | (frame_index >= self._stride)] = -1
+        return np.where(at >= 0, np.append(self._order, -1)[at], -1)
+
+
+def _find(ascending: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N,) where each is in an ascending array, -1 where it is not."""
+    if len(ascending) == 0:
+        return np.full(len(wanted), -1)
+    at = np.minimum(np.searchsorted(ascending, wanted), len(ascending) - 1)
+    return np.where(ascending[at] == wanted, at, -1)
