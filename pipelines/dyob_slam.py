@@ -151,7 +151,7 @@ class DyObSlam:
             is_keyframe = self._grow_map(view, tracked)
             if is_keyframe:
                 self._geometry.add_keyframe()
-            seen = self._observations(view, tracked)
+            seen = self._observations(view, tracked, offset)
         with self._stage("backend"):
             self._anchors.add(self.map, view.frame_index, tracked.T_world_camera)
             if is_keyframe:
@@ -339,7 +339,9 @@ class DyObSlam:
 
     # ---------------------------------------------------------------- answers
 
-    def _observations(self, view: View, tracked: TrackedFrame) -> FrameObservations:
+    def _observations(
+        self, view: View, tracked: TrackedFrame, disparity_offset_px: float
+    ) -> FrameObservations:
         """What this frame saw, for the batch."""
         T, sigma = tracked.T_world_camera, self.sensor.noise.sigma_disparity_px
         static = static_sightings(self.map, self._static_tracks, view.frame_index, T, sigma)
@@ -349,6 +351,7 @@ class DyObSlam:
             tracked.status is TrackingStatus.OK,
             T,
             Sightings.concatenate(static, self._objects.sightings),
+            disparity_offset_px,
         )
 
     def _result(

@@ -71,7 +71,8 @@ class FrameObservations:
 
     is_tracked: whether the pose was measured. T_world_camera: (4, 4). sightings: those that agreed
     with the front-end's motions, of the static world and of objects; some may be of the frame
-    before, where a point was only found back once this one was there.
+    before, where a point was only found back once this one was there. disparity_offset_px: by which
+    its disparities are corrected, see `frontend.disparity_offset`.
     """
 
     frame_index: int
@@ -79,6 +80,7 @@ class FrameObservations:
     is_tracked: bool
     T_world_camera: Array
     sightings: Sightings
+    disparity_offset_px: float = 0.0
 
     def __post_init__(self) -> None:
         check_shape("FrameObservations", "T_world_camera", self.T_world_camera, (4, 4))

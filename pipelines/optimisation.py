@@ -29,6 +29,7 @@ from pipelines.config import BatchConfig
 from pipelines.errors import DyObError, FormatError
 from pipelines.evaluation import evaluate_result
 from pipelines.frame_observations import FrameObservations
+from pipelines.frontend.disparity_offset import with_last_offset
 from pipelines.io import folder as names
 from pipelines.io.files import disk_error, read_json, write_json
 from pipelines.io.folder import open_result_folder
@@ -107,6 +108,7 @@ def _read_start(folder: Path) -> _Start:
     objects = ObjectEstimates.empty()
     if (kept / names.OBJECTS_CSV).exists():
         objects = read_objects(kept / names.OBJECTS_CSV)
+    log = with_last_offset(read_camera(folder / names.OBSERVATIONS), log)
     return _Start(log, objects, kept)
 
 

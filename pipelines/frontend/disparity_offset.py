@@ -12,8 +12,12 @@ Deviation: the paper trusts the calibration.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
+from pipelines.frame_observations import FrameObservations
 from pipelines.frontend.motion_only_ba import observation_covariance, whitening
 from pipelines.geometry import (
     invert_T,
@@ -40,6 +44,22 @@ def offset_share(camera: StereoCamera, disparity_px: Array) -> Array:
     disparity_px: of any shape, as is the answer.
     """
     return 1.0 - np.float32(_TARGET_BASELINES / camera.fx) * disparity_px
+
+
+def with_last_offset(
+    camera: StereoCamera, log: Sequence[FrameObservations]
+) -> list[FrameObservations]:
+    """The log of a run with all disparities as the offset was known at its end."""
+    last = log[-1].disparity_offset_px if log else 0.0
+    corrected = []
+    for entry in log:
+        step = last - entry.disparity_offset_px
+        disparity = entry.sightings.disparity_px
+        sightings = replace(
+            entry.sightings, disparity_px=disparity + step * offset_share(camera, disparity)
+        )
+        corrected.append(replace(entry, sightings=sightings, disparity_offset_px=last))
+    return corrected
 
 
 class DisparityOffset:

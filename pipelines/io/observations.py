@@ -23,13 +23,20 @@ from pipelines.io.files import disk_error, read_json, replacing, write_json
 from pipelines.types import Array, StereoCamera
 
 FRAMES_A_CHUNK = 50
-VERSION = 1
+VERSION = 2
 MAP_POINTS = "map_points.npz"
 POSES = "poses.npz"
 CAMERA = "camera.json"
 _OTHERS = (MAP_POINTS, POSES, CAMERA)
 _SINGLE = ("uv_px", "disparity_px", "sigma_uv_px", "sigma_disparity_px", "position_m")  # float32
-_FRAMES = ("frame_index", "timestamp_s", "is_tracked", "T_world_camera", "n_sightings")
+_FRAMES = (
+    "frame_index",
+    "timestamp_s",
+    "is_tracked",
+    "T_world_camera",
+    "disparity_offset_px",
+    "n_sightings",
+)
 _PREFIX = "sighting_"
 
 
@@ -140,6 +147,7 @@ def _write_chunk(path: Path, frames: list[FrameObservations]) -> None:
         "timestamp_s": np.array([f.timestamp_s for f in frames], float),
         "is_tracked": np.array([f.is_tracked for f in frames], bool),
         "T_world_camera": np.array([f.T_world_camera for f in frames], float),
+        "disparity_offset_px": np.array([f.disparity_offset_px for f in frames], float),
         "n_sightings": np.array([len(f.sightings) for f in frames], np.int64),
     }
     columns |= {_PREFIX + name: array for name, array in arrays.items()}
@@ -206,9 +214,14 @@ def _read_chunk(path: Path) -> list[FrameObservations]:
             raise ValueError(f"{len(sightings)} sightings for {len(ends)} frames")
         return [
             FrameObservations(
-                int(index), float(stamp), bool(tracked), T, sightings[np.arange(end - n, end)]
+                int(index),
+                float(stamp),
+                bool(tracked),
+                T,
+                sightings[np.arange(end - n, end)],
+                float(offset),
             )
-            for index, stamp, tracked, T, n, end in zip(*columns[:5], ends, strict=True)
+            for index, stamp, tracked, T, offset, n, end in zip(*columns[:6], ends, strict=True)
         ]
     except (ValueError, IndexError) as error:
         raise FormatError(

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from pipelines.config import MappingConfig
-from pipelines.frontend.disparity_offset import DisparityOffset, follow_camera, offset_share
+from pipelines.frame_observations import FrameObservations, Sightings
+from pipelines.frontend.disparity_offset import (
+    DisparityOffset,
+    follow_camera,
+    offset_share,
+    with_last_offset,
+)
 from pipelines.frontend.motion_only_ba import estimate_camera_pose
 from pipelines.geometry import exp_se3, inside_image, invert_T, project_stereo, transform_points
 from pipelines.mapping.point_filter import make_points, refine_points
@@ -155,3 +161,23 @@ def test_a_shift_of_the_camera_is_handed_to_the_points_the_other_way():
     shift = np.array([0.3, -0.2, 0.5])
     slopes = follow_camera(np.eye(4), points, np.r_[0.0, 0.0, 0.0, shift])
     np.testing.assert_allclose(slopes, np.tile(-shift, (20, 1)))
+
+
+def test_what_early_frames_saw_is_corrected_by_the_offset_as_it_is_known_at_the_end():
+    def entry(k, offset_px):
+        true = np.array([4.0, 40.0, np.nan, 0.1 * CAMERA.fx])
+        measured = (true - 0.3) / (1 - 10 / CAMERA.fx * 0.3)
+        seen = Sightings(
+            np.full(4, k), np.zeros(4, np.int64), np.arange(4), np.zeros((4, 2)),
+            measured + offset_px * offset_share(CAMERA, measured), np.ones(4), np.ones(4),
+            np.zeros((4, 3)),
+        )  # fmt: skip
+        return true, FrameObservations(k, 0.1 * k, True, np.eye(4), seen, offset_px)
+
+    truths, log = zip(*(entry(k, offset) for k, offset in enumerate([0.0, 0.2, 0.3])), strict=True)
+    corrected = with_last_offset(CAMERA, log)
+    assert [e.disparity_offset_px for e in corrected] == [0.3] * 3
+    for truth, entry_now in zip(truths, corrected, strict=True):
+        np.testing.assert_allclose(entry_now.sightings.disparity_px, truth, atol=0.003)
+    assert np.nanmax(np.abs(log[0].sightings.disparity_px - truths[0])) > 0.25
+    assert with_last_offset(CAMERA, []) == []

@@ -27,7 +27,10 @@ def make_frames(n):
             rng.uniform(0, 600, (m, 2)), np.where(rng.random(m) < 0.5, np.nan, 5.0),
             np.full(m, 0.1), np.full(m, 0.2), rng.normal(size=(m, 3)),
         )  # fmt: skip
-        frames.append(FrameObservations(k, 0.1 * k, k % 3 != 0, np.eye(4) * 1.0, sightings))
+        offset_px = 0.02 * k
+        frames.append(
+            FrameObservations(k, 0.1 * k, k % 3 != 0, np.eye(4) * 1.0, sightings, offset_px)
+        )
     return frames
 
 
@@ -47,6 +50,7 @@ def test_round_trip_over_several_chunks(tmp_path, monkeypatch):
         assert (ours.frame_index, ours.timestamp_s, ours.is_tracked) == (
             theirs.frame_index, theirs.timestamp_s, theirs.is_tracked,
         )  # fmt: skip
+        assert ours.disparity_offset_px == theirs.disparity_offset_px
         for name in Sightings.__slots__:
             a, b = getattr(ours.sightings, name), getattr(theirs.sightings, name)
             assert a.shape == b.shape and b.dtype in (np.float64, np.int64)
