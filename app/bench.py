@@ -20,7 +20,7 @@ FAILED = 1  # exit code: some run has no result
 def bench(arguments: Namespace) -> int:
     """`bench [PATH ...]`: 0; 1 where a run failed; 130 after Ctrl-C, which leaves what was done."""
     from pipelines.bench.benchmark import DONE, RESULTS_NAME, Benchmark
-    from pipelines.config import load_config
+    from pipelines.io.config import load_config
     from pipelines.io.folder import create_result_folder
     from pipelines.runner import RESULTS
 

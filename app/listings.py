@@ -20,7 +20,7 @@ _COMMENT_COLUMN = 36
 
 def config(arguments: Namespace) -> int:
     """`config`: the resolved settings as YAML that --config reads back, each with its meaning."""
-    from pipelines.config import load_config
+    from pipelines.io.config import load_config
 
     resolved = load_config(arguments.config, arguments.overrides)
     for section in fields(resolved):

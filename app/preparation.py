@@ -15,8 +15,8 @@ from app.runs import INTERRUPTED
 
 def prepare(arguments: Namespace) -> int:
     """`prepare PATH`: 0 when all is there, 130 after Ctrl-C, whose files the next call keeps."""
-    from pipelines.config import load_config
     from pipelines.datasets import open_sequence
+    from pipelines.io.config import load_config
     from pipelines.prepare import prepare as prepare_sequence
 
     config = load_config(arguments.config, arguments.overrides)

@@ -23,8 +23,8 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
 
 def run(arguments: Namespace) -> int:
     """`run PATH`: 0 when all frames were tried, 130 after Ctrl-C (the result is valid then)."""
-    from pipelines.config import load_config
     from pipelines.datasets import open_sequence
+    from pipelines.io.config import load_config
     from pipelines.lasting_map import LastingMap
 
     viewer = viewing.live_viewer(arguments)
@@ -68,8 +68,8 @@ def run(arguments: Namespace) -> int:
 
 def demo(arguments: Namespace) -> int:
     """`demo`: a small simulated sequence, its result, its pictures, and what to do next."""
-    from pipelines.config import load_config
     from pipelines.datasets import open_sequence
+    from pipelines.io.config import load_config
     from pipelines.io.folder import SCENE
     from viz.plots import plot_result
     from viz.render import render_result
@@ -119,7 +119,7 @@ def evaluate(arguments: Namespace) -> int:
 
 def optimize(arguments: Namespace) -> int:
     """`optimize RESULT`: the batch, from what the run recorded; a table of before and after."""
-    from pipelines.config import load_config
+    from pipelines.io.config import load_config
     from pipelines.io.folder import open_result_folder
     from pipelines.io.result import load_result
     from pipelines.optimisation import optimise_result

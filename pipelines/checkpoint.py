@@ -30,9 +30,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.config import Config, config_to_dict
+from pipelines.config import Config
 from pipelines.datasets.sequence import Sequence
 from pipelines.errors import DyObError, FormatError
+from pipelines.io.config import config_to_dict
 from pipelines.io.files import disk_error, plain, replacing
 from pipelines.io.object_graph import GraphDecoder, GraphEncoder
 from pipelines.types import Frame

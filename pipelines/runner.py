@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.checkpoint import Checkpoints, run_origin
-from pipelines.config import Config, config_to_dict
+from pipelines.config import Config
 from pipelines.datasets.sequence import Sequence
 from pipelines.dyob_slam import DyObSlam
 from pipelines.errors import DatasetError, DyObError, FrameError
@@ -26,6 +26,7 @@ from pipelines.evaluation import evaluate_result
 from pipelines.frontend.view import PreparedFrame
 from pipelines.interruption import Interruption
 from pipelines.io import folder as names
+from pipelines.io.config import config_to_dict
 from pipelines.io.folder import clear_result_folder, is_finished, open_interrupted
 from pipelines.io.observations import ObservationRecorder
 from pipelines.io.result import (
@@ -91,7 +92,7 @@ def run(
     >>> result = run(open_sequence("path/to/data"))
     >>> result.folder, result.Ts_world_camera.shape, result.objects.speed_mps
 
-    config: all settings; the default ones where None, others by `pipelines.config.load_config`.
+    config: all settings; the default ones where None, others by `pipelines.io.config.load_config`.
     output: the folder to write; by default a new one under `results`, with a `latest` link. Files
     of an earlier run in it are replaced. start, frames, stride: which frames to take, all by
     default. sinks: what watches the run, see `Sink`. batch_progress: called with (done, total)

@@ -10,8 +10,9 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from pipelines.config import Config, config_to_dict
+from pipelines.config import Config
 from pipelines.io import folder as names
+from pipelines.io.config import config_to_dict
 from pipelines.io.result import Result
 from viz.markup import Html, table
 

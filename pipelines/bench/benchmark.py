@@ -18,9 +18,10 @@ from pipelines.bench.cases import BenchCase, Progress, labels_of
 from pipelines.bench.measures import FRAME_TIME, errors_of, means_of
 from pipelines.bench.published import published_for
 from pipelines.bench.report import bench_text
-from pipelines.config import Config, config_to_dict
+from pipelines.config import Config
 from pipelines.errors import DyObError
 from pipelines.io import folder as names
+from pipelines.io.config import config_to_dict
 from pipelines.io.files import disk_error, write_json, write_text, write_yaml
 from pipelines.io.folder import check_output
 from pipelines.io.result import Result

@@ -1,1 +1,1 @@
-"""Files of a result folder: trajectories, point clouds, timings, metrics."""
+"""Files of a result folder: settings, trajectories, point clouds, timings, metrics."""

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from app import listings
-from pipelines.config import load_config
 from pipelines.errors import DatasetError
+from pipelines.io.config import load_config
 from pipelines.settings import setting_names
 
 

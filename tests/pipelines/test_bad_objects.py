@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
 from pipelines.datasets.sequence import Sequence
 from pipelines.dyob_slam import DyObSlam
+from pipelines.io.config import load_config
 from pipelines.object_types import ObjectEstimates, ObjectState
 from pipelines.types import Frame, FrameResult, TrackingStatus
 

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
 from pipelines.datasets import open_sequence
 from pipelines.datasets.sequence import Sequence
 from pipelines.dyob_slam import DyObSlam
 from pipelines.errors import FrameError
 from pipelines.evaluation import evaluate_camera
 from pipelines.geometry import invert_T
+from pipelines.io.config import load_config
 from pipelines.types import (
     Frame,
     FrameResult,

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
 from pipelines.datasets.sequence import Sequence
 from pipelines.dyob_slam import DyObSlam
 from pipelines.errors import ConfigError, DyObError, FormatError
 from pipelines.geometry import invert_T, rotation_angle_deg
+from pipelines.io.config import load_config
 from pipelines.io.map_folder import load_map, load_map_objects
 from pipelines.io.result import load_result
 from pipelines.io.trajectory import read_tum

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from pipelines import perception
-from pipelines.config import load_config
 from pipelines.datasets import open_sequence
 from pipelines.datasets.sequence import Sequence
 from pipelines.datasets.simulated.crossing import EVENTS, LEADING_CAR, RETURNING_CAR
 from pipelines.dyob_slam import DyObSlam
 from pipelines.evaluation.object_truth import RunFrames
 from pipelines.evaluation.objects import evaluate_objects
+from pipelines.io.config import load_config
 from pipelines.object_types import Detections, ObjectEstimates, ObjectState
 from pipelines.types import Frame, FrameResult, TrackingStatus
 

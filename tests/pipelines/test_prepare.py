@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from pipelines import prepare_steps
-from pipelines.config import load_config
 from pipelines.datasets import open_sequence
 from pipelines.depth import StereoDepth, to_gray
 from pipelines.errors import ConfigError, DatasetError
 from pipelines.flow.dis import DisFlow
+from pipelines.io.config import load_config
 from pipelines.object_types import Detections
 from pipelines.prepare import prepare
 

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.config import Config, load_config
+from pipelines.config import Config
 from pipelines.datasets import open_sequence
 from pipelines.datasets.sequence import Sequence
 from pipelines.dyob_slam import DyObSlam
 from pipelines.geometry import invert_T, rotation_angle_deg
+from pipelines.io.config import load_config
 from pipelines.types import Array, FrameResult, MotionHypothesis, TrackingStatus
 
 OK, LOST = TrackingStatus.OK, TrackingStatus.LOST

@@ -20,11 +20,12 @@ from pipelines.backend.back_end import ClosingQuestion
 from pipelines.backend.loop_detection import LoopClosure
 from pipelines.backend.pose_graph import build_pose_graph
 from pipelines.checkpoint import Checkpoints, read_checkpoint
-from pipelines.config import Config, load_config
+from pipelines.config import Config
 from pipelines.datasets import open_sequence
 from pipelines.dyob_slam import DyObSlam
 from pipelines.errors import FormatError, FrameError
 from pipelines.geometry import exp_se3
+from pipelines.io.config import load_config
 from pipelines.io.object_graph import GraphDecoder, GraphEncoder
 from pipelines.lasting_map import LastingMap
 from pipelines.runner import run
@@ -302,7 +303,7 @@ def test_a_second_ctrl_c_does_not_wait_and_costs_the_frames_since_the_last_check
 def test_a_run_that_was_killed_goes_on(quick, tmp_path, render_cache) -> None:
     folder = tmp_path / "result"
     program = (
-        "import sys; from pipelines.config import load_config\n"
+        "import sys; from pipelines.io.config import load_config\n"
         "from pipelines.datasets import open_sequence; from pipelines.runner import run\n"
         "options = {'frames': 20, 'scale': 0.4, 'cache': sys.argv[1]}\n"
         "street = open_sequence('simulated:street', **options)\n"

@@ -10,10 +10,10 @@ import sys
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
 from pipelines.datasets import open_sequence
 from pipelines.datasets.simulated.degrade import computed_flow
 from pipelines.dyob_slam import DyObSlam
+from pipelines.io.config import load_config
 from pipelines.io.result import load_result
 from pipelines.runner import run
 from pipelines.types import TrackingStatus

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.config import config_to_dict, load_config
 from pipelines.datasets import open_sequence
 from pipelines.errors import DatasetError
+from pipelines.io.config import config_to_dict, load_config
 from pipelines.io.ply import read_point_cloud
 from pipelines.io.result import Result, load_result
 from pipelines.io.trajectory import read_tum

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import viz.report
-from pipelines.config import Config, config_to_dict
+from pipelines.config import Config
 from pipelines.evaluation import evaluate_result
 from pipelines.geometry import exp_se3, make_T
+from pipelines.io.config import config_to_dict
 from pipelines.io.folder import clear_result_folder
 from pipelines.io.result import ResultWriter, load_result
 from pipelines.object_types import ObjectEstimates

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
 from pipelines.datasets import open_sequence
 from pipelines.datasets.sequence import Sequence
 from pipelines.errors import ConfigError, DyObError
+from pipelines.io.config import load_config
 from pipelines.runner import KeyframeSink, run
 from viz.browser.live_map import LiveFrames
 from viz.viewers import VIEWERS, Viewer, load_viewer

@@ -16,9 +16,10 @@ from pipelines.backend.bundle_adjustment import BundleSolution, adjust_bundle, l
 from pipelines.backend.local_window import local_window, to_correction
 from pipelines.backend.seen_places import SeenPlaces
 from pipelines.backend.worker import WorkerDied
-from pipelines.config import BackendConfig, PlacesConfig, load_config
+from pipelines.config import BackendConfig, PlacesConfig
 from pipelines.dyob_slam import DyObSlam
 from pipelines.geometry import exp_se3
+from pipelines.io.config import load_config
 from pipelines.io.result import load_result
 from pipelines.runner import run
 from pipelines.types import Features, TrackingStatus
