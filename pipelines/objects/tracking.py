@@ -9,42 +9,29 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.config import ObjectsConfig
 from pipelines.frame_observations import Sightings
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
-from pipelines.geometry import (
-    MIN_DEPTH_M,
-    invert_T,
-    project_stereo,
-    transform_points,
-)
-from pipelines.object_types import UNNAMED_CLASS, Detections, ObjectEstimates, ObjectState
-from pipelines.objects.following import Followed, follow_points
+from pipelines.geometry import invert_T, transform_points
+from pipelines.object_types import UNNAMED_CLASS, Detections, ObjectEstimates
+from pipelines.objects.expectation import Expectation
+from pipelines.objects.following import Followed
 from pipelines.objects.frame import LastObjects, ObjectFrame
 from pipelines.objects.identification import carry_missed, identify
-from pipelines.objects.instances import (
-    Instances,
-    describe_instances,
-    middle_of_pixels,
-    relabelled,
-    some_pixels,
-)
+from pipelines.objects.instances import Instances, describe_instances, relabelled
 from pipelines.objects.looking_back import guess_motions, seed_pixels
-from pipelines.objects.motion import move_points
 from pipelines.objects.motion_intake import MotionIntake
 from pipelines.objects.points import ObjectPoints, choose_pixels, points_wanted
 from pipelines.objects.rows import RowTable
 from pipelines.objects.sightings import collect_sightings
 from pipelines.objects.solver import MotionSolver, Solution
 from pipelines.objects.track import ObjectTrack
+from pipelines.objects.unmeasured_intake import UnmeasuredIntake
 from pipelines.types import Array
 
-_MOSTLY_SEEN = 0.6  # of its last mask, below which a mask does not say where an object is
 _ENOUGH = 0.8  # of the points wanted on an object, above which no new ones are taken
-_SURE_SPEED_MPS = 1.0  # m/s, standard deviation of a speed by which points may be expected
 
 
 class ObjectTracker:
@@ -78,7 +65,10 @@ class ObjectTracker:
         for track in self.tracks.values():
             track.predict(dt_s)
         last_points = ObjectPoints.empty() if self._last is None else self._last.points
-        followed = self._follow(view, last_points, T_predicted)
+        followed = Followed.empty()
+        if self._last is not None:
+            expectation = Expectation(self.sensor, self.tracks, self._last, view, T_predicted)
+            followed = expectation.follow(last_points)
         answered = detections is not None
         instances = describe_instances(
             self.camera,
@@ -200,51 +190,8 @@ class ObjectTracker:
         if self._last is not None:
             self._last = replace(self._last, T_world_camera=C @ self._last.T_world_camera)
 
-    # ------------------------------------------------------------- following
-
     def _time_since_last(self, view: View) -> float:
         return 0.0 if self._last is None else view.timestamp_s - self._last.view.timestamp_s
-
-    def _follow(self, view: View, points: ObjectPoints, T_world_camera: Array) -> Followed:
-        """Where points of the last view are now, expected where their objects' motion leads."""
-        if len(points) == 0:
-            return Followed.empty()
-        ids, _ = points.groups()
-        known = np.array([self._is_predictable(int(i)) for i in ids])
-        known |= view.flow_prev_to_curr_px is None
-        return self._follow_by(view, points, self._predicted_Gs(view, ids, T_world_camera), known)
-
-    def _is_predictable(self, object_id: int) -> bool:
-        track = self.tracks[object_id]
-        if track.H_world_curr_prev is not None:
-            return True
-        return track.filter is not None and track.filter.speed_std_mps < _SURE_SPEED_MPS
-
-    def _follow_by(
-        self, view: View, points: ObjectPoints, Gs: Array, known: NDArray[np.bool_]
-    ) -> Followed:
-        """The same by motions Gs (J, 4, 4); `known` (J,) says of which objects they are."""
-        assert self._last is not None
-        _, sizes = points.groups()
-        moved = move_points(Gs, points.position_m, sizes)
-        front = (moved[:, 2] > MIN_DEPTH_M) & np.repeat(known, sizes)
-        expected = np.full((len(points), 2), np.nan)
-        expected[front] = project_stereo(self.camera, moved[front])[:, :2]
-        return follow_points(
-            self._last.view.gray,
-            view.gray,
-            view.flow_prev_to_curr_px,
-            points.uv_px,
-            expected,
-            self.sensor.noise,
-        )
-
-    def _predicted_Gs(self, view: View, ids: NDArray[np.int64], T_world_camera: Array) -> Array:
-        """(J, 4, 4) motions from the last camera to this one, if all goes on as before."""
-        assert self._last is not None
-        dt_s, T_curr_world = self._time_since_last(view), invert_T(T_world_camera)
-        Hs = [self.tracks[int(i)].predicted_motion(dt_s) for i in ids]
-        return np.stack([T_curr_world @ H @ self._last.T_world_camera for H in Hs])
 
     # ---------------------------------------------------------------- motion
 
@@ -271,7 +218,8 @@ class ObjectTracker:
             )
             for solution in solutions:
                 measured_ids.update(intake.take(solution, self.tracks, frame, table))
-        self._take_rest(table, view, frame, measured_ids, T_world_camera)
+        rest = UnmeasuredIntake(self.sensor, self.config, view, frame, T_world_camera)
+        rest.take(self.tracks, measured_ids, self._time_since_last(view), table)
         moved = [self._solver.refine(solution) for solution in solutions]
         points = self._renew_points(view, frame, T_world_camera, ObjectPoints.concatenate(*moved))
         self._note_sightings(view, solutions, moved, points)
@@ -296,15 +244,16 @@ class ObjectTracker:
         last = self._last
         if last is None or self._time_since_last(view) <= 0.0:
             return []
+        expectation = Expectation(self.sensor, self.tracks, last, view, T_world_camera)
         if not frame.noise_was_learned and self.sensor.noise.is_learned:
-            self._follow_again(view, frame, T_world_camera)
-        points, followed = self._with_seeds(view, frame, T_world_camera)
+            self._follow_again(frame, expectation)
+        points, followed = self._with_seeds(frame, expectation)
         solutions = []
         if len(points):
             ids, _ = points.groups()
             still = invert_T(T_world_camera) @ last.T_world_camera
             hypotheses = (
-                self._predicted_Gs(view, ids, T_world_camera),
+                expectation.motions(ids),
                 np.repeat(still[None], len(ids), axis=0),
             )
             solutions.append(self._solver.solve(view.disparity_px, points, followed, hypotheses))
@@ -313,89 +262,37 @@ class ObjectTracker:
         points = last.points[np.isin(last.points.object_id, list(guesses))]
         if len(points):
             Gs = np.stack([guesses[int(i)] for i in points.groups()[0]])
-            followed = self._follow_by(view, points, Gs, np.ones(len(Gs), bool))
+            followed = expectation.follow_by(points, Gs, np.ones(len(Gs), bool))
             points, followed = points[followed.valid], followed[followed.valid]
         if len(points):
             Gs = np.stack([guesses[int(i)] for i in points.groups()[0]])
             solutions.append(self._solver.solve(view.disparity_px, points, followed, (Gs,)))
         return solutions
 
-    def _follow_again(self, view: View, frame: ObjectFrame, T_world_camera: Array) -> None:
+    def _follow_again(self, frame: ObjectFrame, expectation: Expectation) -> None:
         """The weights were guesses when the points were followed: once more with better ones."""
         noise = self.sensor.noise
         noise.borrow("object_flow", "flow")
         noise.borrow("object_alignment", "alignment")
-        frame.followed = self._follow(view, frame.points, T_world_camera)
+        frame.followed = expectation.follow(frame.points)
         self._keep_points_in_sight(frame)
 
     def _with_seeds(
-        self, view: View, frame: ObjectFrame, T_world_camera: Array
+        self, frame: ObjectFrame, expectation: Expectation
     ) -> tuple[ObjectPoints, Followed]:
         """The tracked points, and points of new objects found back in the view before."""
-        flow_px = view.flow_prev_to_curr_px
-        if not frame.new_ids or flow_px is None or self._last is None:
+        last, flow_px = expectation.last, expectation.view.flow_prev_to_curr_px
+        if not frame.new_ids or flow_px is None:
             return frame.points, frame.followed
-        ids, uv = seed_pixels(self._last, frame, flow_px, self.config.max_points)
-        seeds = self._solver.create_points(self._last.view.disparity_px, ids, uv)
-        followed = self._follow(view, seeds, T_world_camera)
+        ids, uv = seed_pixels(last, frame, flow_px, self.config.max_points)
+        seeds = self._solver.create_points(last.view.disparity_px, ids, uv)
+        followed = expectation.follow(seeds)
         seeds, followed = seeds[followed.valid], followed[followed.valid]
         owners = np.concatenate([frame.points.object_id, seeds.object_id])
         return (
             ObjectPoints.concatenate(frame.points, seeds),
             Followed.concatenate(frame.followed, followed)[np.argsort(owners, kind="stable")],
         )
-
-    # ------------------------------------------------------------------ rest
-
-    def _take_rest(
-        self,
-        table: RowTable,
-        view: View,
-        frame: ObjectFrame,
-        measured_ids: set[int],
-        T_world_camera: Array,
-    ) -> None:
-        """Objects without a motion in this frame: in sight, coasting, or to be forgotten."""
-        t, dt_s = view.timestamp_s, self._time_since_last(view)
-        for object_id, track in list(self.tracks.items()):
-            carried = object_id in frame.carried_ids
-            if carried and frame.answered and object_id not in measured_ids:
-                frame.remove(object_id)  # no detection and no motion bears it out
-            in_sight = object_id in frame.windows
-            if in_sight:
-                track.seen_s = t
-            if object_id in measured_ids:
-                continue
-            track.coast(dt_s)
-            if in_sight:
-                self._see_without_motion(table, view, frame, track, T_world_camera)
-            elif t - track.seen_s > self.config.max_age_s or track.filter is None:
-                del self.tracks[object_id]
-            elif track.state in (ObjectState.MOVING, ObjectState.COASTING) or track.surely_moves:
-                track.set_state(ObjectState.COASTING, t)
-                center = track.filter.center_m + track.middle_offset_m
-                table.add(track, np.nan, center_m=center, box_px=np.full(4, np.nan))
-
-    def _see_without_motion(
-        self,
-        table: RowTable,
-        view: View,
-        frame: ObjectFrame,
-        track: ObjectTrack,
-        T_world_camera: Array,
-    ) -> None:
-        """Too small, too far, or too uncertain: where it is may still be known."""
-        v, u = some_pixels(frame.labels, track.object_id, frame.windows[track.object_id])
-        center = middle_of_pixels(
-            self.camera, view.disparity_px, v, u, self.sensor.min_disparity_px
-        )
-        center = transform_points(T_world_camera, center[None])[0]
-        n_pixels = np.count_nonzero(frame.mask(track.object_id))
-        if np.isfinite(center).all() and n_pixels >= _MOSTLY_SEEN * track.area_px:
-            track.take_center(center)  # else something is passing before it
-        if track.state is not ObjectState.STOPPED or not track.is_anchored:
-            track.set_state(ObjectState.UNKNOWN, view.timestamp_s)
-        table.add(track, frame.scores[track.object_id], center_m=center)
 
     def _renew_points(
         self, view: View, frame: ObjectFrame, T_world_camera: Array, moved: ObjectPoints
