@@ -44,7 +44,7 @@ _HEAD = "head"
 _ANEW = "run it again without --resume"
 _MANY = 3  # differences that are named
 _CLASSES = {
-    "backend.back_end": ("BackEnd", "ClosingQuestion", "SettlingQuestion", "WindowQuestion"),
+    "backend.back_end": ("BackEnd",),
     "backend.bundle_adjustment": ("BundleProblem",),
     "backend.keyframe_sightings": ("KeyframeSightings",),
     "backend.local_window": ("BundleWindow",),
@@ -53,6 +53,7 @@ _CLASSES = {
     "backend.place_database": ("PlaceDatabase",),
     "backend.point_tracks": ("PointTracks",),
     "backend.pose_graph": ("PoseGraph",),
+    "backend.questions": ("ClosingQuestion", "SettlingQuestion", "WindowQuestion"),
     "backend.seen_places": ("SeenPlaces",),
     "backend.vocabulary": ("BowVector",),
     "camera_tracking": ("CameraTracking",),

@@ -1,10 +1,9 @@
 """Bundle adjustment and loops beside tracking: when they are asked, when an answer moves the map.
 
-Owns the one question that is under way and the judgement of its answer. What is adjusted is chosen
-by `local_window` and solved by `bundle_adjustment`; loops are found by `loop_detection`, closed by
-`pose_graph` and then settled by `loop_adjustment`; `mapping.correction` moves the map. A loop goes
-before a local adjustment, but not before the full one of the loop that was found last. What sees
-old places where they should be is settled as well, whenever the map has grown by a fifth.
+Owns which question is under way; what each asks and when its answer is believed is in `questions`.
+Loops are found by `loop_detection`; `mapping.correction` moves the map. A loop goes before a local
+adjustment, but not before the full one of the loop that was found last. What sees old places where
+they should be is settled as well, whenever the map has grown by a fifth.
 
 An answer is applied a fixed number of frames after its question, however soon it is there: so the
 same run moves the same map at the same frame, in a process or in this one.
@@ -14,138 +13,30 @@ from __future__ import annotations
 
 import logging
 from concurrent.futures import Future
-from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
-import numpy as np
-
-from pipelines.backend.bundle_adjustment import (
-    BundleProblem,
-    BundleSolution,
-    adjust_bundle,
-    load_solver,
-)
-from pipelines.backend.local_window import BundleWindow, local_window, to_correction
-from pipelines.backend.loop_adjustment import (
-    LoopAnswer,
-    LoopQuestion,
-    adjust_loop,
-    loop_adjustment_correction,
-    loop_question,
-)
+from pipelines.backend.bundle_adjustment import load_solver
+from pipelines.backend.local_window import local_window
+from pipelines.backend.loop_adjustment import loop_question
 from pipelines.backend.loop_detection import FEWEST_KEYFRAMES, LoopClosure, LoopDetector
-from pipelines.backend.pose_graph import (
-    PoseGraph,
-    build_pose_graph,
-    loop_correction,
-    solve_pose_graph,
+from pipelines.backend.pose_graph import build_pose_graph
+from pipelines.backend.questions import (
+    ClosingQuestion,
+    Question,
+    SettlingQuestion,
+    WindowQuestion,
 )
 from pipelines.backend.seen_places import SeenPlaces
 from pipelines.backend.worker import InlineWorker, ProcessWorker, Worker
 from pipelines.config import BackendConfig
 from pipelines.frontend.sensor import Sensor
-from pipelines.geometry import invert_T, rotation_angle_deg
 from pipelines.mapping.correction import MapCorrection
 from pipelines.mapping.sparse_map import SparseMap
-from pipelines.types import Array, Features
+from pipelines.types import Features
 
-_MIN_AGREEING = 0.5  # share of observations; where fewer agree, something else is wrong
-_MAX_MOVE_M, _MAX_MOVE_SHARE = 0.05, 0.02  # of a keyframe, and of its way from the held ones
-_MAX_TURN_DEG = 0.5  # of a keyframe
 _OBSERVATIONS_PER_EDGE = 3  # what an edge of the pose graph costs, in observations
 _GROWN = 1.2  # times the keyframes of the last full adjustment, which are worth another
 _log = logging.getLogger("dyob.backend")
-
-
-class _Question(Protocol):
-    """Work to be done. what: for people. due: the count of frames at which its answer is applied.
-
-    ask: hands it to a worker, which answers the same however often. judge: makes a correction of
-    the answer, or says why it is refused. closes: the loop that it does, if it is the pose graph's.
-    is_full: whether it is the full adjustment.
-    """
-
-    what: ClassVar[str]
-    is_full: ClassVar[bool]
-
-    @property
-    def due(self) -> int: ...
-
-    @property
-    def closes(self) -> LoopClosure | None: ...
-
-    def ask(self, worker: Worker) -> Future[Any]: ...
-
-    def judge(self, answer: Any) -> MapCorrection | str: ...
-
-
-@dataclass(frozen=True, slots=True)
-class ClosingQuestion:
-    """Where all keyframes go when a loop is closed by the pose graph."""
-
-    what: ClassVar[str] = "loop closing"
-    is_full: ClassVar[bool] = False
-    due: int
-    graph: PoseGraph
-    closes: LoopClosure
-
-    def ask(self, worker: Worker) -> Future[Any]:
-        """As of `_Question`."""
-        return worker.submit(solve_pose_graph, self.graph)
-
-    def judge(self, answer: Array) -> MapCorrection:
-        """As of `_Question`."""
-        return loop_correction(self.graph, answer, self.closes)
-
-
-@dataclass(frozen=True, slots=True)
-class WindowQuestion:
-    """Where the latest keyframes and their points go."""
-
-    what: ClassVar[str] = "local bundle adjustment"
-    is_full: ClassVar[bool] = False
-    due: int
-    window: BundleWindow
-    rounds: int
-    iterations: int
-    closes: LoopClosure | None = None
-
-    def ask(self, worker: Worker) -> Future[Any]:
-        """As of `_Question`."""
-        return worker.submit(adjust_bundle, self.window.problem, self.rounds, self.iterations)
-
-    def judge(self, answer: BundleSolution) -> MapCorrection | str:
-        """As of `_Question`."""
-        return reason_to_refuse(self.window, answer) or to_correction(self.window, answer)
-
-
-@dataclass(frozen=True, slots=True)
-class SettlingQuestion:
-    """Where all of a map goes in which a loop is closed."""
-
-    what: ClassVar[str] = "full bundle adjustment"
-    is_full: ClassVar[bool] = True
-    due: int
-    question: LoopQuestion
-    config: BackendConfig
-    closes: LoopClosure | None = None
-
-    def ask(self, worker: Worker) -> Future[Any]:
-        """As of `_Question`."""
-        return worker.submit(adjust_loop, self.question, self.config)
-
-    def judge(self, answer: LoopAnswer) -> MapCorrection | str:
-        """As of `_Question`."""
-        reason = reason_to_refuse_all(answer.problem, answer.solution)
-        if reason is not None:
-            return reason
-        _log.info(
-            "loop settled: %d keyframes and %d points, %d of them mapped twice",
-            len(answer.problem.held),
-            len(answer.point_ids),
-            len(answer.duplicates),
-        )
-        return loop_adjustment_correction(answer)
 
 
 class BackEnd:
@@ -163,7 +54,7 @@ class BackEnd:
     ) -> None:
         self.sensor, self.config = sensor, config
         self.worker = worker or (ProcessWorker() if config.process else InlineWorker())
-        self._question: _Question | None = None
+        self._question: Question | None = None
         self._answer: Future[Any] | None = None
         self._closed: LoopClosure | None = None  # the latest that the map has closed, not settled
         self._must_settle = False  # at once, as the pose graph had to close it
@@ -207,7 +98,7 @@ class BackEnd:
             self._settle_loop(sparse_map, *loop)
         return None if self._question is None else self._judge(self._question)
 
-    def _judge(self, question: _Question) -> MapCorrection | None:
+    def _judge(self, question: Question) -> MapCorrection | None:
         """The correction that the question has led to, once its answer is there."""
         answer = self._awaited(question)
         self._question = self._answer = None
@@ -265,13 +156,13 @@ class BackEnd:
         graph = build_pose_graph(sparse_map, [loop])
         due = self._due(len(graph.i) * _OBSERVATIONS_PER_EDGE)
         self.n_loops += 1
-        self._ask(ClosingQuestion(due, graph, loop))
+        self._ask(ClosingQuestion(due, graph, closes=loop))
         return True
 
-    def _ask(self, question: _Question) -> None:
+    def _ask(self, question: Question) -> None:
         self._question, self._answer = question, question.ask(self.worker)
 
-    def _awaited(self, question: _Question) -> Future[Any]:
+    def _awaited(self, question: Question) -> Future[Any]:
         """The answer to come; it is asked for again where a run was interrupted meanwhile."""
         if self._answer is None:
             self._answer = question.ask(self.worker)
@@ -334,40 +225,3 @@ class BackEnd:
         level = logging.INFO if self._warned else logging.WARNING
         self._warned = True
         _log.log(level, "%s dropped, the run goes on: %s", what, error)
-
-
-def reason_to_refuse_all(problem: BundleProblem, solution: BundleSolution) -> str | None:
-    """Why a solution is not believed, however far it moves what: None where it is.
-
-    It must lower the error of the observations that agree in the end, and most must agree.
-    """
-    if not np.isfinite(solution.Ts_world_camera).all():
-        return "its poses are not finite"
-    if not solution.error_after < solution.error_before:
-        return f"error {solution.error_before:.1f} before, {solution.error_after:.1f} after"
-    share = float(solution.inliers.mean())
-    if share < _MIN_AGREEING:
-        return f"only {share:.0%} of the observations agree with it"
-    return None
-
-
-def reason_to_refuse(window: BundleWindow, solution: BundleSolution) -> str | None:
-    """Why a solution of neighbours is not believed, None where it is.
-
-    Besides all else no keyframe may jump: beyond 5 cm and 2 % of its way from the nearest held one,
-    or by half a degree, which is far more than tracking errs by among neighbours.
-    """
-    problem = window.problem
-    reason = reason_to_refuse_all(problem, solution)
-    if reason is not None:
-        return reason
-    Ts_old, Ts_new = problem.Ts_world_camera, solution.Ts_world_camera
-    moved_m = np.linalg.norm(Ts_new[:, :3, 3] - Ts_old[:, :3, 3], axis=1)
-    centers_m = Ts_old[:, :3, 3]
-    way_m = np.linalg.norm(centers_m[:, None] - centers_m[problem.held], axis=2).min(axis=1)
-    if (moved_m > _MAX_MOVE_M + _MAX_MOVE_SHARE * way_m).any():
-        return f"a keyframe would move by {moved_m.max():.3f} m"
-    turned_deg = rotation_angle_deg(invert_T(Ts_old) @ Ts_new)
-    if (turned_deg > _MAX_TURN_DEG).any():
-        return f"a keyframe would turn by {turned_deg.max():.2f} deg"
-    return None

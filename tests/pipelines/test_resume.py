@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from pipelines import checkpoint
-from pipelines.backend.back_end import ClosingQuestion
 from pipelines.backend.loop_detection import LoopClosure
 from pipelines.backend.pose_graph import build_pose_graph
+from pipelines.backend.questions import ClosingQuestion
 from pipelines.checkpoint import Checkpoints, read_checkpoint
 from pipelines.config import Config
 from pipelines.datasets import open_sequence
@@ -229,7 +229,7 @@ def test_a_loop_that_is_being_closed_is_closed_and_settled_alike(street) -> None
     for k in range(7):
         ours.process(street.read(k))
     loop = loop_of(ours)
-    ours._backend._ask(ClosingQuestion(8, build_pose_graph(ours.map, [loop]), loop))
+    ours._backend._ask(ClosingQuestion(8, build_pose_graph(ours.map, [loop]), closes=loop))
     theirs = through_arrays(ours)
     for k in range(7, 10):
         one, other = (slam.process(street.read(k)) for slam in (ours, theirs))

@@ -11,9 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.backend.back_end import BackEnd, reason_to_refuse
+from pipelines.backend.back_end import BackEnd
 from pipelines.backend.bundle_adjustment import BundleSolution, adjust_bundle, load_solver
 from pipelines.backend.local_window import local_window, to_correction
+from pipelines.backend.questions import reason_to_refuse
 from pipelines.backend.seen_places import SeenPlaces
 from pipelines.backend.worker import WorkerDied
 from pipelines.config import BackendConfig, PlacesConfig
