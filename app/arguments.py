@@ -23,8 +23,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "path", metavar="PATH", help="data folder, or simulated:NAME such as simulated:street"
     )
-    parser.add_argument("--dataset", metavar="NAME", help="layout, where the guess is wrong")
-    parser.add_argument("--sequence", metavar="NAME", help="which sequence, where PATH holds many")
+    _add_layout(parser)
     parser.add_argument("--start", type=_not_negative, default=0, metavar="K", help="first frame")
     parser.add_argument("--frames", type=_positive, metavar="N", help="stop after N frames")
     parser.add_argument("--stride", type=_positive, default=1, metavar="S", help="every S-th frame")
@@ -36,6 +35,11 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     _add_resume(parser)
     _add_settings(parser)
     _add_output(parser)
+
+
+def _add_layout(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--dataset", metavar="NAME", help="layout, where the guess is wrong")
+    parser.add_argument("--sequence", metavar="NAME", help="which sequence, where PATH holds many")
 
 
 def _add_resume(parser: argparse.ArgumentParser) -> None:
@@ -168,8 +172,7 @@ def _add_server(parser: argparse.ArgumentParser) -> None:
 
 def _add_prepare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", metavar="PATH", help="data folder or video")
-    parser.add_argument("--dataset", metavar="NAME", help="layout, where the guess is wrong")
-    parser.add_argument("--sequence", metavar="NAME", help="which sequence, where PATH holds many")
+    _add_layout(parser)
     parser.add_argument(
         "--output",
         metavar="DIR",
@@ -209,8 +212,7 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
 
 def _add_doctor(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", metavar="PATH", nargs="?", help="a data folder to look at")
-    parser.add_argument("--dataset", metavar="NAME", help="layout, where the guess is wrong")
-    parser.add_argument("--sequence", metavar="NAME", help="which sequence, where PATH holds many")
+    _add_layout(parser)
 
 
 def _add_datasets(parser: argparse.ArgumentParser) -> None:
