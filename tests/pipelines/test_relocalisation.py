@@ -42,10 +42,10 @@ def drive(
     return results
 
 
-def off_m_deg(T: Array, sequence: Sequence, k: int) -> tuple[float, float]:
-    """Error of a pose in the world of the sequence's first camera."""
+def off_m_deg(T: Array, sequence: Sequence, k: int, origin: int) -> tuple[float, float]:
+    """Error of a pose in the world of frame `origin`, where the run began."""
     Ts = sequence.ground_truth().Ts_world_camera
-    E = invert_T(invert_T(Ts[0]) @ Ts[k]) @ T
+    E = invert_T(invert_T(Ts[origin]) @ Ts[k]) @ T
     return float(np.linalg.norm(E[:3, 3])), float(rotation_angle_deg(E))
 
 
@@ -53,19 +53,36 @@ def first_found(results: list[FrameResult]) -> int:
     return [r.status for r in results].index(OK)
 
 
+def assert_found(
+    back: list[FrameResult],
+    sequence: Sequence,
+    first: int,
+    *,
+    within: int,
+    metres: float,
+    degrees: float,
+    origin: int = 0,
+) -> None:
+    """Found within so many frames, kept from then on, and all the time where it truly is.
+
+    back: of frames `first`, `first` + 1, ... of the sequence. metres, degrees: the largest errors.
+    """
+    n = first_found(back)
+    assert n < within
+    assert back[n].hypothesis is RELOCALISATION
+    assert [r.status for r in back[n:]] == [OK] * (len(back) - n)
+    for k, result in enumerate(back[n:], start=first + n):
+        off_m, off_deg = off_m_deg(result.T_world_camera, sequence, k, origin)
+        assert 1e-5 < off_m < metres
+        assert 1e-5 < off_deg < degrees
+
+
 def test_put_back_to_the_beginning_the_camera_is_found_by_how_the_place_looks(street) -> None:
     slam = DyObSlam(street.camera, settings())
     drive(slam, street, range(20))
     assert len(slam.places) == len(slam.map.keyframes) > 8  # beyond the latest that are tried
     back = drive(slam, street, range(1, 8), 20)
-    n = first_found(back)
-    assert n < 3
-    assert back[n].hypothesis is RELOCALISATION
-    assert [r.status for r in back[n:]] == [OK] * (7 - n)
-    for k, result in enumerate(back[n:], start=1 + n):
-        metres, degrees = off_m_deg(result.T_world_camera, street, k)
-        assert 1e-5 < metres < 0.05
-        assert 1e-5 < degrees < 0.15
+    assert_found(back, street, 1, within=3, metres=0.05, degrees=0.15)
 
 
 def test_a_jump_tells_no_speed_of_objects_and_leaves_no_velocity(street) -> None:
@@ -100,14 +117,26 @@ def test_forty_frames_back_the_camera_is_found_within_five(scene, degrade, rende
     slam = DyObSlam(sequence.camera)
     drive(slam, sequence, range(60))
     back = drive(slam, sequence, range(6, 16), 60)
-    n = first_found(back)
-    assert n < 5
-    assert back[n].hypothesis is RELOCALISATION
-    assert [r.status for r in back[n:]] == [OK] * (10 - n)
-    for k, result in enumerate(back[n:], start=6 + n):
-        metres, degrees = off_m_deg(result.T_world_camera, sequence, k)
-        assert 1e-5 < metres < 0.15
-        assert 1e-5 < degrees < 0.15
+    assert_found(back, sequence, 6, within=5, metres=0.15, degrees=0.15)
+
+
+def test_a_hundred_frames_back_in_a_room_the_camera_is_found_within_five(render_cache) -> None:
+    """Every second frame of a camera that looks around; it is put back between two of them."""
+    sequence = open_sequence("simulated:room", frames=112, scale=0.3, cache=render_cache)
+    slam = DyObSlam(sequence.camera)
+    before = drive(slam, sequence, range(1, 112, 2))
+    back = drive(slam, sequence, range(111 - 100, 111 - 95), len(before))
+    assert_found(back, sequence, 11, within=5, metres=0.2, degrees=2.0, origin=1)
+
+
+def test_a_hundred_frames_back_in_a_real_kitchen_the_camera_is_found(real_data) -> None:
+    """Every third frame of a Kinect, some 2 a second, and back to one that was left out."""
+    sequence = open_sequence(real_data("7scenes_redkitchen_200f"))
+    slam = DyObSlam(sequence.camera)
+    before = drive(slam, sequence, range(60, 172, 3))
+    assert [r.status for r in before] == [OK] * 38
+    back = drive(slam, sequence, range(71, 76), 38)
+    assert_found(back, sequence, 71, within=5, metres=0.05, degrees=1.5, origin=60)
 
 
 @pytest.mark.slow
