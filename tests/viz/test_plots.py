@@ -11,13 +11,8 @@ from pipelines.evaluation import evaluate_result
 from pipelines.geometry import exp_se3
 from pipelines.io.result import ResultWriter, load_result
 from pipelines.object_types import ObjectEstimates
-from pipelines.types import (
-    FrameResult,
-    GroundTruth,
-    MotionHypothesis,
-    ObjectTruth,
-    TrackingStatus,
-)
+from pipelines.types import GroundTruth, ObjectTruth, TrackingStatus
+from tests.frame_results import frame_result
 from viz import style
 from viz.plots import figure_of, plot_result, possible_plots
 
@@ -27,18 +22,10 @@ def write(folder, n: int, *, truth: bool, timings: bool = True) -> None:
     Ts = np.array([np.linalg.matrix_power(step, k) for k in range(n)]).reshape(-1, 4, 4)
     errors = exp_se3(np.random.default_rng(0).normal(0.0, 1e-3, (n, 6)))
     results = [
-        FrameResult(
-            frame_index=k,
-            timestamp_s=0.1 * k,
+        frame_result(
+            k,
+            T @ error,
             status=TrackingStatus.LOST if k == 7 else TrackingStatus.OK,
-            T_world_camera=T @ error,
-            pose_covariance=np.eye(6),
-            hypothesis=MotionHypothesis.NONE,
-            is_keyframe=False,
-            keypoints_px=np.empty((0, 2)),
-            point_ids=np.empty(0, np.int64),
-            inliers=np.empty(0, bool),
-            reprojection_rmse_px=0.0,
             timings_ms={"orb": 9.0, "total": 12.0 + k % 3} if timings else {},
         )
         for k, (T, error) in enumerate(zip(Ts, errors, strict=True))
@@ -90,13 +77,11 @@ def write_objects(folder, n: int = 30) -> None:
     )  # fmt: skip
     truth = ObjectTruth(index, ids, np.full(M, "car"), T, boxes, ids == 1)
     results = [
-        FrameResult(
-            k, 0.1 * k, TrackingStatus.OK, np.eye(4), np.eye(6), MotionHypothesis.NONE, False,
-            np.empty((0, 2)), np.empty(0, np.int64), np.empty(0, bool), 0.0,
-            objects[objects.frame_index == k], timings_ms={"total": 12.0},
+        frame_result(
+            k, np.eye(4), objects=objects[objects.frame_index == k], timings_ms={"total": 12.0}
         )
         for k in range(n)
-    ]  # fmt: skip
+    ]
     writer = ResultWriter(folder)
     writer.write_camera(results)
     writer.write_timings(results)

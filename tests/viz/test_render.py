@@ -7,7 +7,8 @@ import pytest
 from pipelines.errors import DyObError, FormatError
 from pipelines.geometry import exp_se3
 from pipelines.io.result import ResultWriter, load_result
-from pipelines.types import FrameResult, GroundTruth, MotionHypothesis, StaticMap, TrackingStatus
+from pipelines.types import GroundTruth, StaticMap
+from tests.frame_results import frame_result
 from viz import offscreen, style
 from viz.figures import digits
 from viz.legend import scale_bar_m
@@ -25,22 +26,7 @@ POINT_COLOR = (20, 120, 60)
 def folder(tmp_path):
     rng = np.random.default_rng(0)
     Ts = np.array([np.linalg.matrix_power(STEP, k) for k in range(40)])
-    results = [
-        FrameResult(
-            frame_index=k,
-            timestamp_s=0.1 * k,
-            status=TrackingStatus.OK,
-            T_world_camera=T,
-            pose_covariance=np.eye(6),
-            hypothesis=MotionHypothesis.NONE,
-            is_keyframe=False,
-            keypoints_px=np.empty((0, 2)),
-            point_ids=np.empty(0, np.int64),
-            inliers=np.empty(0, bool),
-            reprojection_rmse_px=0.0,
-        )
-        for k, T in enumerate(Ts)
-    ]
+    results = [frame_result(k, T) for k, T in enumerate(Ts)]
     sides = rng.choice([-6.0, 6.0], 1500)
     points = np.stack([sides, rng.uniform(-2, 1, 1500), rng.uniform(0, 40, 1500)], 1)
     colors = np.tile(np.uint8(POINT_COLOR), (1500, 1))

@@ -15,14 +15,8 @@ from pipelines.io.config import config_to_dict
 from pipelines.io.folder import clear_result_folder
 from pipelines.io.result import ResultWriter, load_result
 from pipelines.object_types import ObjectEstimates
-from pipelines.types import (
-    FrameResult,
-    GroundTruth,
-    MotionHypothesis,
-    ObjectTruth,
-    StaticMap,
-    TrackingStatus,
-)
+from pipelines.types import GroundTruth, ObjectTruth, StaticMap
+from tests.frame_results import frame_result
 from viz import style
 from viz.overlay import write_image
 from viz.playback import build_playback
@@ -61,14 +55,14 @@ def write(folder: Path, *, whole: bool = True, name: str = "a street") -> Path:
     objects = two_objects()
     Ts = np.array([make_T(np.eye(3), np.array([0.0, 0.0, 0.5 * k])) for k in range(N)])
     results = [
-        FrameResult(
-            k, 0.1 * k, TrackingStatus.OK, Ts[k], np.eye(6), MotionHypothesis.PNP_RANSAC, False,
-            np.empty((0, 2)), np.empty(0, np.int64), np.empty(0, bool), 0.0,
-            objects[objects.frame_index == k] if whole else ObjectEstimates.empty(),
+        frame_result(
+            k,
+            Ts[k],
+            objects=objects[objects.frame_index == k] if whole else ObjectEstimates.empty(),
             timings_ms={"flow": 4.0, "total": 12.0},
         )
         for k in range(N)
-    ]  # fmt: skip
+    ]
     writer = ResultWriter(folder)
     writer.write_camera(results)
     if not whole:

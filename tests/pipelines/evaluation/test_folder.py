@@ -11,13 +11,8 @@ from pipelines.evaluation import evaluate_result, metrics_text
 from pipelines.evaluation.table import STATISTICS
 from pipelines.geometry import exp_se3, invert_T
 from pipelines.io.result import ResultWriter, run_metrics
-from pipelines.types import (
-    FrameResult,
-    GroundTruth,
-    MotionHypothesis,
-    StaticMap,
-    TrackingStatus,
-)
+from pipelines.types import FrameResult, GroundTruth, StaticMap
+from tests.frame_results import frame_result
 
 STEP = exp_se3(np.array([0.0, 0.01, 0.0, 0.0, 0.0, 1.0]))
 NO_MAP = StaticMap(
@@ -40,22 +35,7 @@ def results(n: int, jump_at: int, left_out: tuple[int, ...] = ()) -> list[FrameR
     for k in range(n):
         T = np.linalg.matrix_power(STEP, k)
         T[1, 3] += float(k >= jump_at)
-        out.append(
-            FrameResult(
-                frame_index=k,
-                timestamp_s=0.1 * k,
-                status=TrackingStatus.OK,
-                T_world_camera=T,
-                pose_covariance=np.eye(6),
-                hypothesis=MotionHypothesis.CONSTANT_VELOCITY,
-                is_keyframe=False,
-                keypoints_px=np.empty((0, 2)),
-                point_ids=np.empty(0, np.int64),
-                inliers=np.empty(0, bool),
-                reprojection_rmse_px=0.0,
-                timings_ms={"total": 20.0},
-            )
-        )
+        out.append(frame_result(k, T, timings_ms={"total": 20.0}))
     return [r for r in out if r.frame_index not in left_out]
 
 
@@ -138,18 +118,10 @@ def write_objects_run(folder, world, index, noise=lambda objects: objects) -> No
     """A run over the frames `index` of the small world, with its truth, as files."""
     estimates = noise(world.estimates(index))
     frames = [
-        FrameResult(
-            frame_index=int(k),
+        frame_result(
+            k,
+            invert_T(world.cameras[index[0]]) @ world.cameras[k],
             timestamp_s=float(world.stamps[k]),
-            status=TrackingStatus.OK,
-            T_world_camera=invert_T(world.cameras[index[0]]) @ world.cameras[k],
-            pose_covariance=np.eye(6),
-            hypothesis=MotionHypothesis.CONSTANT_VELOCITY,
-            is_keyframe=False,
-            keypoints_px=np.empty((0, 2)),
-            point_ids=np.empty(0, np.int64),
-            inliers=np.empty(0, bool),
-            reprojection_rmse_px=0.0,
             objects=estimates[estimates.frame_index == k],
             timings_ms={"total": 20.0},
         )

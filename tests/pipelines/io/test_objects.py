@@ -13,14 +13,8 @@ from pipelines.io.object_truth import read_object_truth, write_object_truth
 from pipelines.io.objects import read_objects, write_object_trajectories, write_objects
 from pipelines.io.result import ResultWriter, load_result, run_metrics
 from pipelines.object_types import ObjectEstimates
-from pipelines.types import (
-    FrameResult,
-    GroundTruth,
-    MotionHypothesis,
-    ObjectTruth,
-    StaticMap,
-    TrackingStatus,
-)
+from pipelines.types import FrameResult, GroundTruth, ObjectTruth, StaticMap
+from tests.frame_results import frame_result
 
 FIRST_COLUMNS = (
     "frame,timestamp_s,object_id,class_name,score,state,x1_px,y1_px,x2_px,y2_px,n_points,"
@@ -71,15 +65,10 @@ def make_objects(n: int = 6) -> ObjectEstimates:
 
 
 def make_frames(objects: ObjectEstimates) -> list[FrameResult]:
-    nothing = np.empty(0, np.int64)
     return [
-        FrameResult(
-            int(k), 0.1 * int(k), TrackingStatus.OK, np.eye(4), np.eye(6), MotionHypothesis.NONE,
-            False, np.empty((0, 2)), nothing, np.empty(0, bool), 0.1,
-            objects[objects.frame_index == k],
-        )
+        frame_result(int(k), np.eye(4), objects=objects[objects.frame_index == k])
         for k in np.unique(objects.frame_index)
-    ]  # fmt: skip
+    ]
 
 
 def test_columns_and_cells_as_any_reader_sees_them(tmp_path):
