@@ -16,6 +16,7 @@ from rich.console import Console
 from app import console
 from pipelines.types import TrackingStatus
 
+CURSOR_HIDDEN, CURSOR_SHOWN = "\x1b[?25l", "\x1b[?25h"  # while a bar is drawn, and after it
 METRICS = {
     "run": {"sequence": "street", "frames": 3, "tracked": 2, "lost": 1, "interrupted": True},
     "camera": {"ate_rmse_m": 0.0123},
@@ -51,7 +52,10 @@ def test_a_run_that_ends_early_closes_the_bar(screen) -> None:
     bar = console.Progress()
     bar.start(SEQUENCE, 3, None, None)
     bar.finish()
+    said = screen.getvalue()
+    assert said.count(CURSOR_HIDDEN) == said.count(CURSOR_SHOWN) == int(console.stderr.is_terminal)
     bar.finish()
+    assert screen.getvalue() == said
 
 
 def test_counting_shows_how_far_something_is(screen) -> None:

@@ -69,5 +69,7 @@ def test_every_figure_has_a_column() -> None:
     keys = {measure.key for measure in (*MEASURES, FRAME_TIME)}
     names = [("kitti_tracking", "0000"), ("kitti_odometry", "06"), ("vdo", "drive_deg")]
     for dataset, name in names:
-        for entry in published_for(dataset, name):
+        entries = published_for(dataset, name)
+        assert entries
+        for entry in entries:
             assert set(entry.values) <= keys and entry.source
