@@ -5,7 +5,8 @@ Owns the folders' writing, and sequences that alter frames on their way. Rendere
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -54,6 +55,14 @@ def render_cache(tmp_path_factory) -> Path:
 def street(render_cache) -> Sequence:
     """20 frames of a street with traffic: exact depth, flow and masks."""
     return open_sequence("simulated:street", frames=N_FRAMES, scale=SCALE, cache=render_cache)
+
+
+@pytest.fixture(scope="session")
+def short_street(street) -> Altered:
+    """Its first ten frames, where many runs are made."""
+    short = Altered(street)
+    short.timestamps_s = short.timestamps_s[:10]
+    return short
 
 
 @pytest.fixture(scope="session")
@@ -112,6 +121,14 @@ def paste_board(
             Frame(k, 0.1 * k, image, None, depth, flow if k > 0 else None, labels, {5: "car"})
         )
     return frames
+
+
+@pytest.fixture
+def hears_ctrl_c() -> Iterator[None]:
+    """A background job is started deaf to it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

@@ -1,44 +1,28 @@
 """Masks and moments that no object tracker likes: each gives an answer that says what is known.
 
-Files that are damaged are in `test_bad_input`; here are frames as a program may hand them in.
+Files that are damaged are in `test_bad_masks`; here are frames as a program may hand them in.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
 
 from pipelines.datasets.sequence import Sequence
 from pipelines.dyob_slam import DyObSlam
-from pipelines.io.config import load_config
 from pipelines.object_types import ObjectEstimates, ObjectState
 from pipelines.types import Frame, FrameResult, TrackingStatus
+from tests.pipelines.processing import Alter, process, rows_of, statuses
 
-Alter = Callable[[Frame], Frame]
 OK, LOST = TrackingStatus.OK, TrackingStatus.LOST
 N_FRAMES = 10
 FASTEST_MPS = 20.0  # of all that moves in the street
 
 
-def process(
-    sequence: Sequence,
-    alter: Alter = lambda frame: frame,
-    settings: tuple[str, ...] = (),
-    frames: Iterable[int] = range(N_FRAMES),
-) -> list[FrameResult]:
-    slam = DyObSlam(sequence.camera, load_config(None, settings))
-    return [slam.process(alter(sequence.read(k))) for k in frames]
-
-
-def rows_of(results: list[FrameResult]) -> ObjectEstimates:
-    return ObjectEstimates.concatenate(*(r.objects for r in results))
-
-
-def statuses(results: list[FrameResult]) -> list[TrackingStatus]:
-    return [r.status for r in results]
+def process_some(street: Sequence, alter: Alter = lambda frame: frame) -> list[FrameResult]:
+    return process(street, alter, frames=range(N_FRAMES))
 
 
 def masked(labels: np.ndarray, frame: Frame) -> Frame:
@@ -80,14 +64,14 @@ def assert_unknown(objects: ObjectEstimates) -> None:
 
 @pytest.fixture(scope="module")
 def exact(street: Sequence) -> list[FrameResult]:
-    return process(street)
+    return process_some(street)
 
 
 # ------------------------------------------------------------ none, or nothing but
 
 
 def test_masks_that_are_all_empty_are_a_street_without_objects(street) -> None:
-    results = process(street, lambda frame: masked(np.zeros(shape_of(frame)), frame))
+    results = process_some(street, lambda frame: masked(np.zeros(shape_of(frame)), frame))
     assert statuses(results) == [OK] * N_FRAMES
     assert len(rows_of(results)) == 0
     assert all(r.object_labels is None for r in results)
@@ -101,7 +85,7 @@ def test_a_picture_full_of_objects_is_lost_but_no_crash(street, n_objects: int) 
         labels[:, labels.shape[1] // n_objects :] = 2
         return masked(labels, frame)
 
-    results = process(street, full)
+    results = process_some(street, full)
     assert statuses(results) == [LOST] * N_FRAMES
     assert [r.objects.object_id.tolist() for r in results] == [[*range(1, n_objects + 1)]] * 10
     assert_unknown(rows_of(results))
@@ -112,7 +96,7 @@ def test_a_mask_over_the_whole_picture_costs_its_frames_alone(street) -> None:
     def full(frame: Frame) -> Frame:
         return masked(np.ones(shape_of(frame)), frame) if 4 <= frame.index < 6 else frame
 
-    results = process(street, full)
+    results = process_some(street, full)
     assert statuses(results) == [OK] * 4 + [LOST] * 2 + [OK] * 4
     assert n_motions(results)[4:7] == [0, 0, 0]
     assert min(n_motions(results)[8:]) > 2
@@ -130,7 +114,7 @@ def test_an_object_of_three_pixels_is_unknown(street) -> None:
         labels[70, 200:203] = 1
         return masked(labels, frame)
 
-    results = process(street, speck)
+    results = process_some(street, speck)
     assert statuses(results) == [OK] * N_FRAMES
     assert [len(r.objects) for r in results] == [1] * N_FRAMES
     assert_unknown(rows_of(results))
@@ -198,8 +182,8 @@ def test_labels_may_be_sparse_and_high(street, exact) -> None:
     def all_cars(frame: Frame) -> Frame:
         return masked(frame.instance_labels, frame)
 
-    results = process(street, high)
-    for one, other in zip(results, process(street, all_cars), strict=True):
+    results = process_some(street, high)
+    for one, other in zip(results, process_some(street, all_cars), strict=True):
         np.testing.assert_array_equal(one.objects.object_id, other.objects.object_id)
         np.testing.assert_array_equal(one.objects.speed_mps, other.objects.speed_mps)
         np.testing.assert_array_equal(one.object_labels, other.object_labels)
@@ -221,7 +205,7 @@ def test_a_time_stamp_that_repeats_divides_nothing_by_zero(street, exact) -> Non
         return dataclasses.replace(frame, timestamp_s=0.4) if frame.index == 5 else frame
 
     with np.errstate(divide="raise", invalid="raise"):
-        results = process(street, repeated)
+        results = process_some(street, repeated)
     assert statuses(results) == [OK] * N_FRAMES
     assert n_motions(results)[5] == 0  # no time has passed: no speed
     assert n_motions(results)[4] > 3
@@ -232,7 +216,7 @@ def test_a_time_stamp_that_repeats_divides_nothing_by_zero(street, exact) -> Non
 
 
 def test_time_that_stands_still_throughout(street) -> None:
-    results = process(street, lambda frame: dataclasses.replace(frame, timestamp_s=1.0))
+    results = process_some(street, lambda frame: dataclasses.replace(frame, timestamp_s=1.0))
     assert statuses(results) == [OK] * N_FRAMES
     assert n_motions(results) == [0] * N_FRAMES
     assert set(rows_of(results).state) == {str(ObjectState.UNKNOWN)}
@@ -264,7 +248,7 @@ def dark(frame: Frame) -> Frame:
 
 
 def test_no_motion_is_told_while_the_camera_is_lost_nor_right_after(street) -> None:
-    results = process(street, dark)
+    results = process_some(street, dark)
     assert statuses(results) == [OK] * 5 + [LOST] * 2 + [OK] * 3
     motions = n_motions(results)
     assert motions[4] > 3
@@ -275,7 +259,7 @@ def test_no_motion_is_told_while_the_camera_is_lost_nor_right_after(street) -> N
 
 def test_identities_survive_a_lost_camera(street, exact) -> None:
     """By their masks, which this sequence brings in the dark, too."""
-    results = process(street, dark)
+    results = process_some(street, dark)
     moving = exact[4].objects
     n_kept = 0
     for object_id in moving.object_id:

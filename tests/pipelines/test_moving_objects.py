@@ -1,4 +1,4 @@
-"""Moving objects through the whole system: motion, speed, identity and masks, against the truth.
+"""Moving objects through the whole system: motion, speed and masks, against the truth.
 
 Bounds are about twice what was measured; lower ones say that a perfect score would be suspicious.
 """
@@ -6,37 +6,22 @@ Bounds are about twice what was measured; lower ones say that a perfect score wo
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
 from pipelines import perception
-from pipelines.datasets import open_sequence
 from pipelines.datasets.sequence import Sequence
-from pipelines.datasets.simulated.crossing import EVENTS, LEADING_CAR, RETURNING_CAR
 from pipelines.dyob_slam import DyObSlam
 from pipelines.evaluation.object_truth import RunFrames
 from pipelines.evaluation.objects import evaluate_objects
-from pipelines.io.config import load_config
-from pipelines.object_types import Detections, ObjectEstimates, ObjectState
+from pipelines.object_types import Detections, ObjectState
 from pipelines.types import Frame, FrameResult, TrackingStatus
+from tests.pipelines.processing import process, rows_of
 
-Alter = Callable[[Frame], Frame]
 MASKLESS = (6, 7, 11, 14, 15)
 MOVING, STOPPED = str(ObjectState.MOVING), str(ObjectState.STOPPED)
-
-
-def process(
-    sequence: Sequence, settings: tuple[str, ...] = (), alter: Alter = lambda frame: frame
-) -> list[FrameResult]:
-    slam = DyObSlam(sequence.camera, load_config(None, settings))
-    return [slam.process(alter(sequence.read(k))) for k in range(len(sequence))]
-
-
-def rows_of(results: list[FrameResult]) -> ObjectEstimates:
-    return ObjectEstimates.concatenate(*(r.objects for r in results))
 
 
 def errors(sequence: Sequence, results: list[FrameResult]) -> dict[str, Any]:
@@ -46,17 +31,6 @@ def errors(sequence: Sequence, results: list[FrameResult]) -> dict[str, Any]:
     stamps = np.array([r.timestamp_s for r in results])
     frames = RunFrames(index, stamps, truth.Ts_world_camera[index])
     return evaluate_objects(rows_of(results), truth.objects, frames)
-
-
-def seen_as(sequence: Sequence, results: list[FrameResult], object_id: int) -> dict[int, int]:
-    """Frame -> lasting id that most pixels of a true object have, where 20 of them are seen."""
-    found = {}
-    for result in results:
-        own = sequence.read(result.frame_index).instance_labels == object_id
-        if own.sum() >= 20:
-            ids = np.zeros(1, int) if result.object_labels is None else result.object_labels[own]
-            found[result.frame_index] = int(np.bincount(ids).argmax())
-    return found
 
 
 def without_masks(frame: Frame) -> Frame:
@@ -76,7 +50,7 @@ def exact(street: Sequence) -> list[FrameResult]:
 @pytest.fixture(scope="module")
 def dropped(street: Sequence) -> list[FrameResult]:
     """The same where frames `MASKLESS` have no masks."""
-    return process(street, (), masks_dropped)
+    return process(street, masks_dropped)
 
 
 # ------------------------------------------------------------------ accuracy
@@ -149,7 +123,7 @@ def test_a_speed_is_told_only_of_what_was_measured(exact) -> None:
 
 def test_scene_flow_decides_by_metres_a_frame(street, exact) -> None:
     """The paper's rule: the same motions, but 12 cm a frame is not reached by what is slow."""
-    results = process(street, ("objects.motion_rule=scene_flow",))
+    results = process(street, settings=["objects.motion_rule=scene_flow"])
     assert_motion(errors(street, results), 30)
     by_flow, by_speed = (
         rows[np.isin(rows.state, ["coasting"], invert=True)]
@@ -169,7 +143,7 @@ def test_stretched_time_stamps_halve_the_speeds(street, exact) -> None:
         return dataclasses.replace(frame, timestamp_s=2.0 * frame.timestamp_s)
 
     n_compared = 0
-    for one, other in zip(exact, process(street, (), stretched), strict=True):
+    for one, other in zip(exact, process(street, stretched), strict=True):
         for i in np.flatnonzero((one.objects.state == MOVING) & (one.objects.speed_mps > 2.0)):
             mask = one.object_labels == one.objects.object_id[i]
             its_id = np.bincount(other.object_labels[mask]).argmax()  # specks shift the numbers
@@ -237,7 +211,7 @@ def test_carried_masks_are_kept_off_by_the_camera(street, dropped) -> None:
 
 
 def test_a_network_that_runs_on_every_third_frame(street) -> None:
-    results = process(street, ("detector.every_n=3",))
+    results = process(street, settings=["detector.every_n=3"])
     found = errors(street, results)
     assert_motion(found, 30)
     assert found["coverage"]["share"] > 0.55
@@ -272,7 +246,7 @@ def test_a_detector_that_throws_once_costs_no_object(street, exact, monkeypatch,
 
 
 def test_without_any_mask_geometry_finds_the_moving_car(street) -> None:
-    results = process(street, ("detector.name=motion",), without_masks)
+    results = process(street, without_masks, ["detector.name=motion"])
     found = errors(street, results)
     assert_motion(found, 15)
     assert 0.25 < found["coverage"]["share"] < 1.0
@@ -282,7 +256,7 @@ def test_without_any_mask_geometry_finds_the_moving_car(street) -> None:
 
 
 def test_objects_that_are_not_wanted_are_masked_and_nothing_more(street, exact) -> None:
-    results = process(street, ("objects.enabled=false",))
+    results = process(street, settings=["objects.enabled=false"])
     assert len(rows_of(results)) == 0
     for result, known in zip(results, exact, strict=True):
         assert result.object_labels is None
@@ -292,160 +266,3 @@ def test_objects_that_are_not_wanted_are_masked_and_nothing_more(street, exact) 
         assert (labels[y, x] == 0).all()
         away_m = np.linalg.norm(result.T_world_camera[:3, 3] - known.T_world_camera[:3, 3])
         assert away_m < 2e-3
-
-
-# ---------------------------------------------------------------- identities
-
-
-def assert_survives(sequence: Sequence, results: list[FrameResult], object_id: int) -> None:
-    """One id from before the first of its events to after the last, and never another."""
-    found = seen_as(sequence, results, object_id)
-    ids = set(found.values()) - {0}
-    assert len(ids) == 1, f"object {object_id}: {found}"
-    assert sum(i == 0 for i in found.values()) <= 2
-
-
-def coasting_errors_m(
-    sequence: Sequence, results: list[FrameResult], object_id: int
-) -> dict[int, float]:
-    """Frame -> distance of a true object's centre from where it coasts; no motion is told there."""
-    truth = sequence.ground_truth().objects
-    own_id = max(set(seen_as(sequence, results, object_id).values()))
-    errors_m = {}
-    for result in results:
-        objects, k = result.objects, result.frame_index
-        for i in np.flatnonzero((objects.object_id == own_id) & (objects.state == "coasting")):
-            (row,) = np.flatnonzero((truth.frame_index == k) & (truth.object_id == object_id))
-            away_m = objects.centers_m[i] - truth.Ts_world_object[row, :3, 3]
-            errors_m[k] = float(np.linalg.norm(away_m))
-            assert np.isnan(objects.Hs_world_curr_prev[i]).all()
-    return errors_m
-
-
-def test_identities_survive_being_hidden(render_cache) -> None:
-    """A van passes before a waiting car, and before someone who walks the other way."""
-    crossing = open_sequence("simulated:crossing", frames=40, scale=0.3, cache=render_cache)
-    results = process(crossing)
-    hidden = [e for e in EVENTS if e.kind == "hidden" and e.frames[1] < 36]
-    assert len(hidden) == 2
-    for event in hidden:
-        first, last = event.frames
-        found = seen_as(crossing, results, event.object_id)
-        assert any(k < first for k in found)
-        assert any(k > last for k in found)
-        assert_survives(crossing, results, event.object_id)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_identities_survive_leaving_the_picture(render_cache, seed) -> None:
-    """Everything of the crossing up to the car that leaves and backs up into view again."""
-    crossing = open_sequence(
-        "simulated:crossing", frames=72, scale=0.4, seed=seed, cache=render_cache
-    )
-    results = process(crossing)
-    for event in EVENTS:
-        assert_survives(crossing, results, event.object_id)
-    assert max(seen_as(crossing, results, RETURNING_CAR)) > 66
-    # Out of sight it brakes, which it was seen to begin, and stands; nobody can know that it then
-    # backs up
-    away = coasting_errors_m(crossing, results, RETURNING_CAR)
-    assert {18, 19} | set(range(44, 67)) <= set(away)
-    assert all(0.05 < away_m < 2.0 for k, away_m in away.items() if k < 58)
-    assert max(away.values()) < 5.0
-    # It was seen from behind, so that its middle is known as that of its rear, half a car off
-    hidden = list(coasting_errors_m(crossing, results, LEADING_CAR).values())
-    assert len(hidden) == 9 or seed > 0
-    assert all(0.5 < away_m < 2.8 for away_m in hidden)
-    assert np.ptp(hidden or [0.0]) < 0.5
-
-
-# ------------------------------------------------------------------ landmarks
-
-
-def run_board(camera, frames: list[Frame], *settings: str) -> tuple[DyObSlam, list[FrameResult]]:
-    """Keyframes are frequent, so that the map grows while the board stands."""
-    settings = ("mapping.keyframe_max_interval=3", *settings)
-    slam = DyObSlam(camera, load_config(None, settings))
-    return slam, [slam.process(frame) for frame in frames]
-
-
-def n_keypoints_on(frame: Frame, result: FrameResult) -> int:
-    x, y = np.rint(result.keypoints_px).astype(int).T
-    return int((frame.instance_labels[y, x] > 0).sum())
-
-
-def n_map_points_at_board(slam: DyObSlam, frames: list[Frame], depth_m: float = 8.0) -> int:
-    """Points of the map where the board ever was; nothing else of the street is there."""
-    points = slam.map.position_m[slam.map.alive]
-    camera = slam.camera
-    z = points[:, 2]
-    u = np.rint(camera.fx * points[:, 0] / z + camera.cx).astype(int)
-    v = np.rint(camera.fy * points[:, 1] / z + camera.cy).astype(int)
-    near = (np.abs(z - depth_m) < 0.3) & (u >= 0) & (u < camera.width)
-    near &= (v >= 0) & (v < camera.height)
-    touched = np.any([frame.instance_labels > 0 for frame in frames], axis=0)
-    street = np.abs(frames[0].depth_m - depth_m) < 0.6
-    street &= frames[0].instance_labels == 0
-    u, v = u[near], v[near]
-    return int((touched[v, u] & ~street[v, u]).sum())
-
-
-def test_a_sliding_board_has_the_speed_that_it_was_given(street, board_frames) -> None:
-    frames = board_frames(8, step_px=lambda k: 3)
-    _, results = run_board(street.camera, frames)
-    true_mps = 3 * 8.0 / street.camera.fx / 0.1
-    for result in results[2:]:
-        assert result.objects.state.tolist() == [MOVING]
-        assert result.objects.speed_mps[0] == pytest.approx(true_mps, rel=0.01)
-        H = result.objects.Hs_world_curr_prev[0]
-        np.testing.assert_allclose(H[:3, 3], [0.1 * true_mps, 0, 0], atol=0.01)
-        np.testing.assert_allclose(H[:3, :3], np.eye(3), atol=2e-3)
-
-
-def test_what_stands_still_is_no_landmark_while_there_are_others(street, board_frames) -> None:
-    frames = board_frames(14)
-    slam, results = run_board(street.camera, frames)
-    assert results[-1].objects.state.tolist() == [STOPPED]
-    assert slam._objects.landmark_ids(frames[-1].timestamp_s) == [1]  # it might serve
-    for frame, result in zip(frames, results, strict=True):
-        assert n_keypoints_on(frame, result) == 0
-    assert n_map_points_at_board(slam, frames) == 0
-
-
-def test_what_has_stood_still_is_a_landmark_where_others_are_few(street, board_frames) -> None:
-    """It fills nearly all of the picture."""
-    frames = board_frames(14, size=(130, 380), at=(10, 30))
-    slam, results = run_board(street.camera, frames, "objects.still_after_s=0.5")
-    assert [r.status for r in results] == [TrackingStatus.OK] * 14
-    on_board = [n_keypoints_on(f, r) for f, r in zip(frames, results, strict=True)]
-    first = next(k for k, n in enumerate(on_board) if n > 0)
-    stood_s = frames[first].timestamp_s - frames[1].timestamp_s
-    assert 0.5 <= stood_s < 1.0
-    assert min(on_board[first:]) > 500
-    assert n_map_points_at_board(slam, frames) > 500
-
-
-def test_never_scarce_enough_means_never(street, board_frames) -> None:
-    frames = board_frames(14, size=(130, 380), at=(10, 30))
-    how = ("objects.still_after_s=0.5", "objects.landmarks_below=0")
-    slam, results = run_board(street.camera, frames, *how)
-    assert sum(n_keypoints_on(f, r) for f, r in zip(frames, results, strict=True)) == 0
-    assert n_map_points_at_board(slam, frames) == 0
-
-
-def test_a_landmark_that_drives_off_takes_its_map_points_with_it(street, board_frames) -> None:
-    how = ("objects.still_after_s=0.4", "objects.landmarks_below=1")
-    frames = board_frames(13, step_px=lambda k: 3 if k >= 9 else 0)
-    slam, before = run_board(street.camera, frames[:9], *how)
-    assert before[-1].objects.state.tolist() == [STOPPED]
-    assert n_keypoints_on(frames[8], before[-1]) > 40
-    assert n_map_points_at_board(slam, frames) > 40
-    for frame in frames[9:]:
-        result = slam.process(frame)
-        assert result.status is TrackingStatus.OK
-        assert result.objects.state.tolist() == [MOVING]
-        assert n_keypoints_on(frame, result) == 0
-        assert n_map_points_at_board(slam, frames) == 0
-        assert np.linalg.norm(result.T_world_camera[:3, 3]) < 1e-3
-    assert len(slam.static_map()) > 500

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import os
 import signal
@@ -19,46 +18,23 @@ from pipelines import checkpoint
 from pipelines.backend.loop_detection import LoopClosure
 from pipelines.backend.pose_graph import build_pose_graph
 from pipelines.backend.questions import ClosingQuestion
-from pipelines.checkpoint import Checkpoints, read_checkpoint
+from pipelines.checkpoint import read_checkpoint
 from pipelines.config import Config
 from pipelines.datasets import open_sequence
 from pipelines.dyob_slam import DyObSlam
-from pipelines.errors import FormatError, FrameError
+from pipelines.errors import FrameError
 from pipelines.geometry import exp_se3
 from pipelines.io.config import load_config
 from pipelines.io.object_graph import GraphDecoder, GraphEncoder
 from pipelines.lasting_map import LastingMap
 from pipelines.runner import run
 from pipelines.types import Frame
+from tests.pipelines.interruption import QUICK, Interrupter
 from viz.overlay import FrameWriter
 
+pytestmark = pytest.mark.usefixtures("hears_ctrl_c")
 ROOT = Path(__file__).resolve().parents[2]
 WITH_TIMES = ("run.log", "timings.json", "metrics.txt")  # beside the batch's, in metrics.json
-QUICK = ("batch.at_end=false",)
-N_FRAMES = 10
-
-
-class Interrupter:
-    """A sink at which Ctrl-C is pressed at some frame."""
-
-    def __init__(self, at: int) -> None:
-        self.at = at
-
-    def start(self, *_: object) -> None: ...
-
-    def frame(self, frame: Frame, result: object) -> None:
-        if frame.index == self.at:
-            signal.raise_signal(signal.SIGINT)
-
-    def finish(self) -> None: ...
-
-
-@pytest.fixture(autouse=True)
-def hears_ctrl_c():
-    """A background job is started deaf to it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 def content(folder: Path) -> dict[str, bytes | dict]:
@@ -91,89 +67,87 @@ def interrupt_and_resume(sequence, config: Config, folder: Path, at: int, **opti
 
 
 @pytest.fixture(scope="module")
-def street(street, altered):
-    """Its first frames alone, as many runs are made here."""
-    short = altered(street)
-    short.timestamps_s = short.timestamps_s[:N_FRAMES]
-    return short
-
-
-@pytest.fixture(scope="module")
-def quick(street, tmp_path_factory) -> Path:
+def quick(short_street, tmp_path_factory) -> Path:
     """A run without a batch; not to be changed by tests."""
     folder = tmp_path_factory.mktemp("whole") / "result"
-    return run(street, load_config(None, QUICK), folder).folder
+    return run(short_street, load_config(None, QUICK), folder).folder
 
 
 # ------------------------------------------------------------------ the bytes
 
 
 @pytest.mark.parametrize("at", [0, 6, 9])
-def test_the_bytes_are_those_of_a_run_that_was_not_interrupted(street, quick, tmp_path, at) -> None:
+def test_the_bytes_are_those_of_a_run_that_was_not_interrupted(
+    short_street, quick, tmp_path, at
+) -> None:
     config = load_config(None, QUICK)
-    check_same(interrupt_and_resume(street, config, tmp_path / "result", at), quick)
+    check_same(interrupt_and_resume(short_street, config, tmp_path / "result", at), quick)
 
 
-def test_a_run_may_be_interrupted_again_and_again(street, quick, tmp_path) -> None:
+def test_a_run_may_be_interrupted_again_and_again(short_street, quick, tmp_path) -> None:
     config, folder = load_config(None, QUICK), tmp_path / "result"
-    run(street, config, folder, sinks=[Interrupter(3)])
+    run(short_street, config, folder, sinks=[Interrupter(3)])
     for at in (4, 7, 8):
-        run(street, config, folder, sinks=[Interrupter(at)], resume=True)
-    run(street, config, folder, resume=True)
+        run(short_street, config, folder, sinks=[Interrupter(at)], resume=True)
+    run(short_street, config, folder, resume=True)
     check_same(folder, quick)
 
 
-def test_the_batch_at_the_end_is_the_same(street, tmp_path) -> None:
+def test_the_batch_at_the_end_is_the_same(short_street, tmp_path) -> None:
     config = load_config(None, ["batch.rounds=1", "batch.max_steps=1", "batch.covariances=false"])
-    whole = run(street, config, tmp_path / "whole").folder
+    whole = run(short_street, config, tmp_path / "whole").folder
     assert (whole / "front_end").exists()
-    check_same(interrupt_and_resume(street, config, tmp_path / "result", 6), whole)
+    check_same(interrupt_and_resume(short_street, config, tmp_path / "result", 6), whole)
 
 
-def test_a_batch_that_was_stopped_is_done_by_resuming(street, tmp_path, monkeypatch) -> None:
+def test_a_batch_that_was_stopped_is_done_by_resuming(short_street, tmp_path, monkeypatch) -> None:
     from pipelines import optimisation
 
     config = load_config(None, ["batch.rounds=1", "batch.max_steps=1", "batch.covariances=false"])
-    whole = run(street, config, tmp_path / "whole", frames=6).folder
+    whole = run(short_street, config, tmp_path / "whole", frames=6).folder
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(optimisation, "optimise_result", stop)
-        run(street, config, tmp_path / "result", frames=6)
-    run(street, config, tmp_path / "result", frames=6, resume=True)
+        run(short_street, config, tmp_path / "result", frames=6)
+    run(short_street, config, tmp_path / "result", frames=6, resume=True)
     check_same(tmp_path / "result", whole)
 
 
-def test_answers_of_the_back_end_that_are_awaited_come_as_they_would_have(street, tmp_path) -> None:
+def test_answers_of_the_back_end_that_are_awaited_come_as_they_would_have(
+    short_street, tmp_path
+) -> None:
     settings = ("backend.local_from_keyframe=0", "mapping.keyframe_max_interval=2")
     config = load_config(None, [*QUICK, *settings, "backend.process=false"])
-    whole = run(street, config, tmp_path / "whole").folder
+    whole = run(short_street, config, tmp_path / "whole").folder
     awaited = []
     for at in (4, 6):
         folder = tmp_path / f"at_{at}"
-        run(street, config, folder, sinks=[Interrupter(at)])
-        origin = checkpoint.run_origin(street, config, range(len(street)), LastingMap().origin())
-        slam = DyObSlam(street.camera, config)
+        run(short_street, config, folder, sinks=[Interrupter(at)])
+        origin = checkpoint.run_origin(
+            short_street, config, range(len(short_street)), LastingMap().origin()
+        )
+        slam = DyObSlam(short_street.camera, config)
         state = read_checkpoint(folder / "checkpoint", origin, slam.fixed_parts())
         awaited.append(state["slam"]["system"]["_backend"]._question is not None)
-        check_same(run(street, config, folder, resume=True).folder, whole)
+        check_same(run(short_street, config, folder, resume=True).folder, whole)
     assert any(awaited)
 
 
-def test_what_moves_by_geometry_alone_is_the_same(street, tmp_path, altered) -> None:
+def test_what_moves_by_geometry_alone_is_the_same(short_street, tmp_path, altered) -> None:
     def bare(frame: Frame) -> Frame:
         return dataclasses.replace(frame, instance_labels=None, flow_prev_to_curr_px=None)
 
     config = load_config(None, [*QUICK, "detector.name=motion"])
-    whole = run(altered(street, bare), config, tmp_path / "whole").folder
+    whole = run(altered(short_street, bare), config, tmp_path / "whole").folder
     found = (whole / "objects.csv").read_text().count("\n")
     assert found > 5  # something to remember
-    check_same(interrupt_and_resume(altered(street, bare), config, tmp_path / "a", 6), whole)
+    check_same(interrupt_and_resume(altered(short_street, bare), config, tmp_path / "a", 6), whole)
 
 
-def test_bad_frames_are_the_same(street, tmp_path, altered) -> None:
+def test_bad_frames_are_the_same(short_street, tmp_path, altered) -> None:
     """Frames that cannot be read, before and after the interruption, and one that is black."""
 
     def damage(frame: Frame) -> Frame:
@@ -185,32 +159,44 @@ def test_bad_frames_are_the_same(street, tmp_path, altered) -> None:
 
     config = load_config(None, [*QUICK, "detector.every_n=3"])
     options = {"start": 2}
-    whole = run(altered(street, damage), config, tmp_path / "whole", **options)
+    whole = run(altered(short_street, damage), config, tmp_path / "whole", **options)
     assert whole.metrics["run"]["skipped"] == 2
     folder = tmp_path / "result"
-    run(altered(street, damage), config, folder, sinks=[Interrupter(6)], **options)
-    run(altered(street, damage), config, folder, resume=True, **options)
+    run(altered(short_street, damage), config, folder, sinks=[Interrupter(6)], **options)
+    run(altered(short_street, damage), config, folder, resume=True, **options)
     check_same(folder, whole.folder)
 
 
-def test_a_map_that_is_continued_is_the_same(street, tmp_path) -> None:
+def test_a_map_that_is_continued_is_the_same(short_street, tmp_path) -> None:
     """Loaded from and saved to one folder, which the interruption has changed meanwhile."""
     config = load_config(None, QUICK)
-    run(street, config, tmp_path / "first", frames=6, lasting_map=LastingMap(save=tmp_path / "a"))
-    run(street, config, tmp_path / "first", frames=6, lasting_map=LastingMap(save=tmp_path / "b"))
+    run(
+        short_street,
+        config,
+        tmp_path / "first",
+        frames=6,
+        lasting_map=LastingMap(save=tmp_path / "a"),
+    )
+    run(
+        short_street,
+        config,
+        tmp_path / "first",
+        frames=6,
+        lasting_map=LastingMap(save=tmp_path / "b"),
+    )
     on_a, on_b = (LastingMap(tmp_path / name, tmp_path / name) for name in "ab")
-    whole = run(street, config, tmp_path / "whole", lasting_map=on_a).folder
+    whole = run(short_street, config, tmp_path / "whole", lasting_map=on_a).folder
     check_same(
-        interrupt_and_resume(street, config, tmp_path / "result", 5, lasting_map=on_b), whole
+        interrupt_and_resume(short_street, config, tmp_path / "result", 5, lasting_map=on_b), whole
     )
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name
 
 
-def test_pictures_go_on_where_they_were(street, tmp_path) -> None:
+def test_pictures_go_on_where_they_were(short_street, tmp_path) -> None:
     config, folder = load_config(None, QUICK), tmp_path / "result"
-    run(street, config, folder, frames=8, sinks=[FrameWriter(every=3), Interrupter(4)])
-    run(street, config, folder, frames=8, sinks=[FrameWriter(every=3)], resume=True)
+    run(short_street, config, folder, frames=8, sinks=[FrameWriter(every=3), Interrupter(4)])
+    run(short_street, config, folder, frames=8, sinks=[FrameWriter(every=3)], resume=True)
     names = sorted(path.name for path in (folder / "frames").iterdir())
     assert names == ["000000.jpg", "000003.jpg", "000006.jpg"]
 
@@ -223,16 +209,16 @@ def loop_of(slam: DyObSlam) -> LoopClosure:
     return LoopClosure(last, 0, off @ keyframe.T_world_camera, keyframe.tracks[:0], off, 10.0)
 
 
-def test_a_loop_that_is_being_closed_is_closed_and_settled_alike(street) -> None:
+def test_a_loop_that_is_being_closed_is_closed_and_settled_alike(short_street) -> None:
     config = load_config(None, ["mapping.keyframe_max_interval=3", "backend.process=false"])
-    ours = DyObSlam(street.camera, config)
+    ours = DyObSlam(short_street.camera, config)
     for k in range(7):
-        ours.process(street.read(k))
+        ours.process(short_street.read(k))
     loop = loop_of(ours)
     ours._backend._ask(ClosingQuestion(8, build_pose_graph(ours.map, [loop]), closes=loop))
     theirs = through_arrays(ours)
     for k in range(7, 10):
-        one, other = (slam.process(street.read(k)) for slam in (ours, theirs))
+        one, other = (slam.process(short_street.read(k)) for slam in (ours, theirs))
         np.testing.assert_array_equal(one.T_world_camera, other.T_world_camera)
         np.testing.assert_array_equal(one.objects.centers_m, other.objects.centers_m)
     assert ours._backend.n_applied == theirs._backend.n_applied == 1
@@ -261,7 +247,9 @@ def through_arrays(ours: DyObSlam) -> DyObSlam:
 # --------------------------------------------------------------- interruption
 
 
-def test_ctrl_c_within_a_frame_waits_for_its_end(street, quick, tmp_path, monkeypatch) -> None:
+def test_ctrl_c_within_a_frame_waits_for_its_end(
+    short_street, quick, tmp_path, monkeypatch
+) -> None:
     config, folder = load_config(None, QUICK), tmp_path / "result"
     process = DyObSlam.process
 
@@ -272,14 +260,14 @@ def test_ctrl_c_within_a_frame_waits_for_its_end(street, quick, tmp_path, monkey
 
     with monkeypatch.context() as patch:
         patch.setattr(DyObSlam, "process", interrupted)
-        partial = run(street, config, folder)
+        partial = run(short_street, config, folder)
     assert partial.metrics["run"]["frames"] == 7
-    run(street, config, folder, resume=True)
+    run(short_street, config, folder, resume=True)
     check_same(folder, quick)
 
 
 def test_a_second_ctrl_c_does_not_wait_and_costs_the_frames_since_the_last_checkpoint(
-    street, quick, tmp_path, monkeypatch
+    short_street, quick, tmp_path, monkeypatch
 ) -> None:
     config, folder = load_config(None, QUICK), tmp_path / "result"
     grow = DyObSlam._grow_map
@@ -292,9 +280,9 @@ def test_a_second_ctrl_c_does_not_wait_and_costs_the_frames_since_the_last_check
 
     with monkeypatch.context() as patch:
         patch.setattr(DyObSlam, "_grow_map", interrupted)
-        partial = run(street, config, folder, checkpoint_every=4)
+        partial = run(short_street, config, folder, checkpoint_every=4)
     assert partial.metrics["run"]["frames"] == 6
-    run(street, config, folder, resume=True)
+    run(short_street, config, folder, resume=True)
     assert "resumed after 4 frames" in (folder / "run.log").read_text()
     check_same(folder, quick)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -308,7 +296,7 @@ def test_a_run_that_was_killed_goes_on(quick, tmp_path, render_cache) -> None:
         "options = {'frames': 20, 'scale': 0.4, 'cache': sys.argv[1]}\n"
         "street = open_sequence('simulated:street', **options)\n"
         f"config = load_config(None, {list(QUICK)})\n"
-        f"run(street, config, sys.argv[2], frames={N_FRAMES}, checkpoint_every=3)\n"
+        "run(street, config, sys.argv[2], frames=10, checkpoint_every=3)\n"
     )
     command = [sys.executable, "-c", program, str(render_cache), str(folder)]
     with subprocess.Popen(command, cwd=ROOT, env={**os.environ, "DYOB_NO_SETUP": "1"}) as process:
@@ -321,49 +309,13 @@ def test_a_run_that_was_killed_goes_on(quick, tmp_path, render_cache) -> None:
     if not (folder / "checkpoint").exists():
         pytest.skip("the run had finished before it was killed")
     street = open_sequence("simulated:street", frames=20, scale=0.4, cache=render_cache)
-    run(street, load_config(None, QUICK), folder, frames=N_FRAMES, resume=True)
+    run(street, load_config(None, QUICK), folder, frames=10, resume=True)
     check_same(folder, quick)
 
 
-# --------------------------------------------------------------------- files
-
-
-def test_a_finished_run_says_so_and_is_left_alone(street, tmp_path, caplog) -> None:
-    config = load_config(None, QUICK)
-    folder = run(street, config, tmp_path / "result", frames=3).folder
-    assert not (folder / "checkpoint").exists()
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    again = run(street, config, folder, frames=3, resume=True)
-    assert again.folder == folder
-    assert "this run is finished, there is nothing to resume" in caplog.text
-    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def test_a_new_run_in_the_folder_forgets_the_checkpoint(street, tmp_path) -> None:
-    config, folder = load_config(None, QUICK), tmp_path / "result"
-    run(street, config, folder, sinks=[Interrupter(2)])
-    run(street, config, folder, frames=2, checkpoint_every=0, sinks=[Interrupter(0)])
-    assert not list(folder.glob("checkpoint/*"))
-    with pytest.raises(FormatError, match="expected the checkpoint of an interrupted run"):
-        run(street, config, folder, frames=2, resume=True)
-
-
-def test_keyframes_and_results_are_written_once(street, tmp_path, monkeypatch) -> None:
-    sizes = []
-    write = Checkpoints._write
-
-    def measured(checkpoints: Checkpoints, state) -> None:
-        write(checkpoints, state)
-        sizes.append([path.stat().st_size for path in checkpoints._stores()])
-
-    monkeypatch.setattr(Checkpoints, "_write", measured)
-    run(street, load_config(None, QUICK), tmp_path / "result", checkpoint_every=4)
-    assert [len(files) for files in sizes] == [1, 2, 3]
-    assert sizes[-1][:2] == sizes[-2]  # nobody touched the earlier ones
-    assert max(sizes[-1]) < 3 * min(sizes[-1])
-
-
-def test_a_disk_that_refuses_costs_the_checkpoint_alone(street, quick, tmp_path, caplog) -> None:
+def test_a_disk_that_refuses_costs_the_checkpoint_alone(
+    short_street, quick, tmp_path, caplog
+) -> None:
     folder = tmp_path / "result"
 
     class Blocker(Interrupter):
@@ -372,102 +324,9 @@ def test_a_disk_that_refuses_costs_the_checkpoint_alone(street, quick, tmp_path,
 
         def frame(self, *_: object) -> None: ...
 
-    run(street, load_config(None, QUICK), folder, sinks=[Blocker(0)], checkpoint_every=4)
+    run(short_street, load_config(None, QUICK), folder, sinks=[Blocker(0)], checkpoint_every=4)
     assert caplog.text.count("no checkpoint, the run goes on") >= 1
     warnings = [r for r in caplog.records if r.levelname == "WARNING"]
     assert len(warnings) == 1
     (folder / "checkpoint").unlink()
     check_same(folder, quick)
-
-
-# ------------------------------------------------------------------- refusal
-
-
-@pytest.fixture
-def stopped(street, tmp_path) -> Path:
-    """The folder of a run that was interrupted."""
-    folder = tmp_path / "result"
-    config = load_config(None, QUICK)
-    return run(street, config, folder, sinks=[Interrupter(3)], checkpoint_every=2).folder
-
-
-def test_other_settings_are_an_error_that_names_them(street, stopped) -> None:
-    config = load_config(None, [*QUICK, "orb.n_features=700", "tracking.seed=3"])
-    with pytest.raises(FormatError, match=r"orb\.n_features 1500 then and 700 now") as raised:
-        run(street, config, stopped, resume=True)
-    assert "tracking.seed 0 then and 3 now" in str(raised.value)
-    assert "without --resume" in str(raised.value)
-    run(street, load_config(None, QUICK), stopped, resume=True)  # nothing was lost by trying
-
-
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [({"frames": 7}, "frames.stop"), ({"stride": 2}, "frames.stride")],
-)
-def test_other_frames_are_an_error(street, stopped, options, named) -> None:
-    with pytest.raises(FormatError, match=named):
-        run(street, load_config(None, QUICK), stopped, resume=True, **options)
-
-
-def test_other_data_are_an_error(street, other_place, stopped, altered) -> None:
-    config = load_config(None, QUICK)
-    with pytest.raises(FormatError, match=r"data\.timestamps"):
-        run(other_place, config, stopped, resume=True)
-
-    def other(frame: Frame) -> Frame:
-        return dataclasses.replace(frame, depth_m=frame.depth_m * np.float32(1.01))
-
-    with pytest.raises(FormatError, match="found another frame 3; give --resume the same data"):
-        run(altered(street, other), config, stopped, resume=True)
-
-    def gone(frame: Frame) -> Frame:
-        raise FrameError("no such file")
-
-    with pytest.raises(FormatError, match="frame 3 as the interrupted run saw it"):
-        run(altered(street, gone), config, stopped, resume=True)
-
-
-def test_another_version_of_the_program_is_an_error(street, stopped, monkeypatch) -> None:
-    monkeypatch.setattr(checkpoint, "_program", lambda: "another")
-    with pytest.raises(FormatError, match="in this version of the program"):
-        run(street, load_config(None, QUICK), stopped, resume=True)
-
-
-def test_no_folder_or_one_of_something_else_is_an_error(street, tmp_path) -> None:
-    with pytest.raises(FormatError, match="no such folder"):
-        run(street, output=tmp_path / "none", resume=True)
-    with pytest.raises(FormatError, match=r"no run\.log in it"):
-        run(street, output=tmp_path, resume=True)
-
-
-def cut(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-100])
-
-
-def change(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-
-
-def test_a_damaged_checkpoint_is_a_sentence(street, stopped) -> None:
-    for name, damage in itertools.product(("state.npz", "000000.npz"), (cut, change, Path.unlink)):
-        path = stopped / "checkpoint" / name
-        before = path.read_bytes()
-        damage(path)
-        with pytest.raises(FormatError, match=r"without --resume") as raised:
-            run(street, load_config(None, QUICK), stopped, resume=True)
-        assert "\n" not in str(raised.value)
-        assert str(path if path.exists() else "checkpoint") in str(raised.value)
-        path.write_bytes(before)
-
-
-def test_a_lost_log_of_observations_is_an_error(street, tmp_path, monkeypatch) -> None:
-    from pipelines.io import observations
-
-    monkeypatch.setattr(observations, "FRAMES_A_CHUNK", 2)
-    config, folder = load_config(None, QUICK), tmp_path / "result"
-    run(street, config, folder, sinks=[Interrupter(5)])
-    (folder / "observations" / "000001.npz").unlink()
-    with pytest.raises(FormatError, match="expected what the frames done so far saw"):
-        run(street, config, folder, resume=True)

@@ -1,18 +1,16 @@
-"""The run loop: which frames it takes, what it writes, whom it tells, and that truth stays out."""
+"""The run loop: which frames it takes, what it writes, and whom it tells."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import logging
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pipelines.datasets import open_sequence
 from pipelines.errors import DatasetError
 from pipelines.io.config import config_to_dict, load_config
 from pipelines.io.ply import read_point_cloud
@@ -20,14 +18,8 @@ from pipelines.io.result import Result, load_result
 from pipelines.io.trajectory import read_tum
 from pipelines.runner import run
 from pipelines.types import Frame, FrameResult, TrackingStatus
+from tests.pipelines.result_files import ESTIMATES, estimates, names_in
 
-ESTIMATES = (
-    "camera_tum.txt",
-    "camera_kitti.txt",
-    "objects.csv",
-    "static_map.ply",
-    "objects_map.ply",
-)
 FILES = {
     *ESTIMATES,
     "config.yaml",
@@ -40,11 +32,6 @@ FILES = {
 }
 BATCH = {"front_end", "observations", "camera_std.csv"}
 TRAJECTORIES = {"objects"}  # a folder, where there was an object
-TRUTH = {
-    "vdo": ("pose_gt.txt", "object_pose.txt"),
-    "tum_rgbd": ("groundtruth.txt",),
-    "kitti_odometry": ("poses.txt",),
-}
 
 
 class Witness:
@@ -68,16 +55,6 @@ class Witness:
 
     def finish(self) -> None:
         self.told.append("finish")
-
-
-def estimates(folder: Path) -> dict[str, bytes]:
-    """Content of every file of the estimate, of each object's trajectory too, by name."""
-    trajectories = sorted(f"objects/{path.name}" for path in (folder / "objects").glob("*"))
-    return {name: (folder / name).read_bytes() for name in (*ESTIMATES, *trajectories)}
-
-
-def names_in(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
 
 
 def poses_of(path: Path) -> Any:
@@ -195,6 +172,25 @@ def test_by_default_results_get_a_folder_and_the_link_latest(street, tmp_path, m
     assert (results / "latest").is_symlink()
     assert (results / "latest").resolve() == second.folder
     assert load_result(results / "latest").folder == second.folder
+
+
+def test_lost_frames_are_in_the_kitti_file_but_not_in_the_tum_file(
+    street, tmp_path, altered
+) -> None:
+    def alter(frame: Frame) -> Frame:
+        frame = dataclasses.replace(frame, flow_prev_to_curr_px=None)
+        if 5 <= frame.index < 7:
+            frame = dataclasses.replace(frame, image=np.zeros_like(frame.image))
+        return frame
+
+    result = run(altered(street, alter), output=tmp_path / "result", frames=10)
+    assert result.timings["frames_status"].count(TrackingStatus.LOST) == 2
+    assert result.metrics["run"]["lost"] == 2
+    assert poses_of(result.folder / "camera_tum.txt").num_poses == 8
+    assert len((result.folder / "camera_kitti.txt").read_text().splitlines()) == 10
+    np.testing.assert_allclose(
+        result.timestamps_s, np.delete(street.timestamps_s[:10], [5, 6]), atol=1e-9
+    )
 
 
 # ------------------------------------------------------------------- frames
@@ -342,71 +338,3 @@ def test_two_runs_give_the_same_bytes(street, tmp_path, whole) -> None:
 def test_the_number_of_sinks_changes_no_byte(street, tmp_path, whole) -> None:
     alone = run(street, output=tmp_path / "alone", sinks=[])
     assert estimates(alone.folder) == estimates(whole[0].folder)
-
-
-# -------------------------------------------------------------------- truth
-
-
-def test_truth_is_opened_after_the_last_frame_alone(street, tmp_path, altered) -> None:
-    sequence = altered(street)
-    run(sequence, output=tmp_path / "result", frames=4)
-    assert sequence.events[:4] == [0, 1, 2, 3]
-    assert "truth" in sequence.events[4:]
-    assert set(sequence.events[4:]) == {"truth"}
-
-
-@pytest.mark.parametrize("dataset", list(TRUTH))
-def test_deleted_truth_changes_no_byte_of_the_estimate(dataset, request, tmp_path) -> None:
-    fixture = {"vdo": "vdo_folder", "tum_rgbd": "tum_folder", "kitti_odometry": "kitti_folder"}
-    folder = request.getfixturevalue(fixture[dataset])
-    blind = tmp_path / "blind" / folder.name
-    shutil.copytree(folder, blind)
-    for name in TRUTH[dataset]:
-        (blind / name).unlink()
-    with_truth = run(open_sequence(folder), output=tmp_path / "with")
-    without = run(open_sequence(blind), output=tmp_path / "without")
-    assert open_sequence(blind).dataset == dataset
-    assert open_sequence(blind).ground_truth() is None
-    assert "camera" in with_truth.metrics
-    assert "camera" not in without.metrics
-    expected = FILES - {"camera_gt_tum.txt", "objects_gt.csv"}
-    if dataset != "kitti_odometry":  # a street without traffic
-        expected |= TRAJECTORIES
-    assert names_in(without.folder) == expected | BATCH
-    assert without.metrics["run"]["tracked"] > 5
-    assert estimates(with_truth.folder) == estimates(without.folder)
-    if dataset == "vdo":  # its masks make objects at once: bytes of something were compared
-        assert len(without.objects) > 50
-        assert (without.objects.state == "moving").sum() > 5
-
-
-def test_false_truth_changes_no_byte_of_the_estimate(vdo_folder, tmp_path) -> None:
-    right = run(open_sequence(vdo_folder), output=tmp_path / "right", frames=5)
-    rows = np.loadtxt(vdo_folder / "pose_gt.txt")
-    rows[:, [4, 8, 12]] *= 3.0  # three times as far
-    np.savetxt(vdo_folder / "pose_gt.txt", rows, fmt="%.9f")
-    objects = np.loadtxt(vdo_folder / "object_pose.txt")
-    objects[:, 2:5] += objects[:, :1]  # every object moves by a metre a frame more
-    np.savetxt(vdo_folder / "object_pose.txt", objects, fmt="%.6f")
-    false = run(open_sequence(vdo_folder), output=tmp_path / "false", frames=5)
-    assert estimates(right.folder) == estimates(false.folder)
-    assert false.metrics["camera"]["rpe_trans_rmse_m"] > 1.0  # it was read, and told apart
-
-
-def test_lost_frames_are_in_the_kitti_file_but_not_in_the_tum_file(
-    street, tmp_path, altered
-) -> None:
-    def alter(frame: Frame) -> Frame:
-        frame = dataclasses.replace(frame, flow_prev_to_curr_px=None)
-        if 5 <= frame.index < 7:
-            frame = dataclasses.replace(frame, image=np.zeros_like(frame.image))
-        return frame
-
-    result = run(altered(street, alter), output=tmp_path / "result", frames=10)
-    assert result.timings["frames_status"].count(TrackingStatus.LOST) == 2
-    assert result.metrics["run"]["lost"] == 2
-    assert poses_of(result.folder / "camera_tum.txt").num_poses == 8
-    assert len((result.folder / "camera_kitti.txt").read_text().splitlines()) == 10
-    np.testing.assert_allclose(
-        result.timestamps_s, np.delete(street.timestamps_s[:10], [5, 6]), atol=1e-9
-    )
