@@ -1,7 +1,7 @@
 """The settings of every step: nested frozen dataclasses, the paper's values where it gives any.
 
-Each step gets its own section only. Owns the values' meaning, ranges and sources. Reading and
-writing them is in `io.config`, merging and type checks in `settings`.
+Each step gets its own section only. Owns the values' meaning, ranges and sources. Reading
+them is in `io.config`, merging and type checks in `settings`.
 """
 
 from __future__ import annotations

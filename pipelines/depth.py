@@ -1,4 +1,4 @@
-"""Step 0: dense depth from a rectified stereo pair, and sub-pixel disparities of single points.
+"""Step 0: dense depth from a rectified stereo pair.
 
 Owns stereo matching. Depth that comes with a sequence does not pass through here.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.config import DepthConfig
-from pipelines.types import Array, Image, StereoCamera
+from pipelines.types import Image, StereoCamera
 
 MAX_DEPTH_M = 1000.0  # a disparity that says more than this is noise about zero
 SGBM_SCALE = 16.0  # OpenCV's fixed point: its disparities are steps of 1/16 px
@@ -24,14 +24,6 @@ MAX_STEP_PX = 0.5  # a refinement that goes farther has found something else
 ROUNDING_NOISE = 1 / 12  # (grey levels)^2, the variance that rounding alone gives a flat patch
 GRADIENT_NOISE = 4.0  # (grey levels / px)^2, keeps the step small where there is no texture
 TINY = np.float32(1e-6)  # keeps divisors off zero
-
-POINT_WINDOW_PX = 5  # half size of the patch that a single point is refined on
-POINT_SIGMA_PX = 3.0  # its weights fall off towards depth edges that may cross the patch
-POINT_ITERATIONS = 3
-MAX_POINT_CHANGE_PX = 0.75
-MAX_POINT_SLOPE = 1.0  # px of disparity per px of image, beyond which no real surface was fitted
-MAX_POINT_RESIDUAL = 25.0  # grey levels, RMS over the patch
-MIN_POINT_GRADIENT = 2.0  # grey levels / px, RMS over the patch, along the row
 
 
 class StereoDepth:
@@ -139,55 +131,6 @@ class StereoDepth:
         return cv2.add(smooth, np.clip(step, -MAX_STEP_PX, MAX_STEP_PX)), excess > 0
 
 
-def refine_disparity(
-    gray_left: Image,
-    gray_right: Image,
-    uv_px: Array,
-    disparity_px: Array,
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Disparities of single points, refined on grey levels along their rows.
-
-    gray_left, gray_right: (H, W) uint8. uv_px: (N, 2) in the left image. disparity_px: (N,)
-    within about half a pixel, NaN unknown. Returns disparities (N,), the given ones where the
-    refinement is not to be trusted, and (N,) bool where it is.
-
-    Fits disparity, its two slopes over the patch and an offset of brightness by Gauss-Newton
-    (Lucas and Kanade, 1981): roads and walls are seen at a slant, and a constant would be biased.
-    """
-    refined, ok = np.array(disparity_px, np.float64), np.isfinite(disparity_px)
-    if not ok.any():
-        return refined, ok
-    span = np.arange(-POINT_WINDOW_PX, POINT_WINDOW_PX + 1, dtype=np.float32)
-    dv, du = (grid.ravel() for grid in np.meshgrid(span, span, indexing="ij"))
-    weight = np.exp(-(du**2 + dv**2) / (2 * POINT_SIGMA_PX**2))
-    weight /= weight.sum()
-    left, right = gray_left.astype(np.float32), gray_right.astype(np.float32)
-    at = np.asarray(uv_px, np.float32)[ok]
-    u, v = at[:, :1] + du, at[:, 1:] + dv
-    patch = _sample(left, u, v)
-    slope = (_sample(left, u + 1, v) - _sample(left, u - 1, v)) / 2
-    jacobian = np.stack([slope, slope * du, slope * dv, np.ones_like(slope)], 1)  # (n, 4, P)
-    weighted = jacobian * weight
-    damping = np.diag([1e-3, 1e-3, 1e-3, 1e-6]).astype(np.float32)
-    to_step = np.linalg.solve(weighted @ jacobian.transpose(0, 2, 1) + damping, weighted)[:, :3]
-
-    plane = np.zeros((len(at), 3), np.float32)  # disparity, its slopes along u and v
-    plane[:, 0] = refined[ok]
-    shape = np.stack([np.ones_like(du), du, dv])
-    for _ in range(POINT_ITERATIONS):
-        error = _sample(right, u - plane @ shape, v) - patch
-        plane += (to_step @ error[..., None])[..., 0]
-    error = _sample(right, u - plane @ shape, v) - patch
-    error -= (error @ weight)[:, None]
-    residual = np.sqrt(error**2 @ weight)
-    good = np.abs(plane[:, 0] - refined[ok]) < MAX_POINT_CHANGE_PX
-    good &= (np.abs(plane[:, 1:]) < MAX_POINT_SLOPE).all(1) & (residual < MAX_POINT_RESIDUAL)
-    good &= np.sqrt(slope**2 @ weight) > MIN_POINT_GRADIENT
-    ok[np.flatnonzero(ok)[~good]] = False
-    refined[ok] = plane[good, 0]
-    return refined, ok
-
-
 def to_gray(image: Image) -> Image:
     """Grey (H, W) uint8 of a grey or RGB image."""
     if image.ndim == 2:
@@ -251,10 +194,3 @@ def _half_mirrored(image: Image) -> Image:
 
 def _half_size(size_px: int) -> int:
     return (size_px + 1) // 2
-
-
-def _sample(image: NDArray[np.float32], u: NDArray, v: NDArray) -> NDArray[np.float32]:
-    """Bilinear grey levels at (n, P) places; the nearest edge's outside the image."""
-    u, v = u.astype(np.float32, copy=False), v.astype(np.float32, copy=False)
-    sampled = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(sampled, np.float32)

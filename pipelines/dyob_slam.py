@@ -1,8 +1,11 @@
 """The system: a frame goes in, a result comes out.
 
 Owns the order of the steps and the state between frames. Each step is a function or a small class
-in `depth`, `perception`, `frontend`, `objects` and `mapping`; ground truth never comes near. The
-steps have the numbers of the design.
+in `depth`, `perception`, `frontend`, `objects` and `mapping`; ground truth never comes near.
+
+Steps have numbers by which all modules call them: 0 depth, 1 masks, 2 flow, 3 ORB features,
+4 camera pose, 5 what moves, 6 multi-view geometry, 7 association of objects, 8 their motion,
+9 their filters, 10 map, 11 places and bundle adjustment beside tracking, 12 batches of a whole run.
 """
 
 from __future__ import annotations

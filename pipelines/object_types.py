@@ -67,7 +67,7 @@ class ObjectEstimates:
     state: (M,) str, values of `ObjectState`.
     boxes_px: (M, 4) x1 y1 x2 y2, first and last pixel columns and rows; NaN where not seen.
     n_points: (M,) int64, points that agree with the motion.
-    Ts_world_object: (M, 4, 4), L of the design: begins with the world's axes at the centre of the
+    Ts_world_object: (M, 4, 4), L: begins with the world's axes at the centre of the
         object's points, and then moves with it; its x axis lies along its motion where it moves
         from the start; NaN where unknown.
     Hs_world_curr_prev: (M, 4, 4), p_world_curr = H @ p_world_prev for matter of the object, since

@@ -159,8 +159,8 @@ def pose_system(
 
     As P = inv(L) X, a view moves with its camera and against its object: dP = dX - Ad(inv(P)) dL.
     Returns pairs first <= second, their blocks (M, 6, 6), and gradient (F + O, 6).
-    Deviation: DESIGN keeps P as a variable, tied to X and L by a stiff factor; to substitute it is
-    exact, and leaves half as many poses.
+    P could be a variable of its own, tied to X and L by a stiff factor; to substitute it is exact,
+    and leaves half as many poses.
     """
     F, n = problem.n_frames, len(views)
     cameras, A = problem.camera_of_view, -adjoint(invert_T(views))

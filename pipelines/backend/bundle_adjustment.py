@@ -1,9 +1,10 @@
-"""Bundle adjustment of keyframes and static points; step 11 of the design.
+"""Bundle adjustment of keyframes and static points; step 11.
 
 Owns the problem, its solution and what is dropped on the way, as arrays that any process can take.
-Which keyframes and points go in is decided by `keyframe_window`. The solver is that of the batches.
+Which keyframes and points go in is decided by `local_window` and `loop_adjustment`; the solver is
+that of the batches.
 
-Deviation: DESIGN has gtsam's stereo factors, with independent errors. Errors of pixels that are
+Deviation: stereo factors, as gtsam has them, err independently. Errors of pixels that are
 followed from image to image add up, as in the batches; gtsam holds and solves the graph of poses.
 """
 

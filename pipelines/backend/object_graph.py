@@ -113,7 +113,7 @@ def _smoothness(o: int, dts_s: Array, config: BatchConfig) -> gtsam.CustomFactor
     """The velocities of the steps to poses o - 1 and o, in the object's axes, are alike.
 
     r = Log(inv(B) C) / dt2 - Log(inv(A) B) / dt1 for poses A, B, C; for equal dt this is, to first
-    order, the constant velocity of the design. It divides by true times, so that frames may lack.
+    order, constant velocity. It divides by true times, so that frames may lack.
     """
     import gtsam
 

@@ -7,7 +7,7 @@ The model: where a point was followed from one frame to the next, the *step* of 
 measured, and errors of steps add up along the track; disparities err anew in each frame. Measured
 on degraded sequences: the error of a followed pixel grows with the square root of the frames since,
 that of its disparity does not grow.
-Deviation: DESIGN's graph has one stereo factor a sighting, with independent errors.
+Deviation: the usual graph has one stereo factor a sighting, with independent errors.
 """
 
 from __future__ import annotations

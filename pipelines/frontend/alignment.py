@@ -3,7 +3,7 @@
 Owns the measurement of where last frame's points are now. Knows no poses.
 
 Deviation: the paper takes features and flow as they are. Aligned patches have a third of the noise
-of ORB corners, and stand in for the design's joint refinement of flow and pose.
+of ORB corners, and stand in for a joint refinement of flow and pose.
 """
 
 from __future__ import annotations

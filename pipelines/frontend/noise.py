@@ -27,7 +27,7 @@ class NoiseModel:
 
     sigma_uv_px: name of the source -> standard deviation per axis. memory: share of the old value
     that each new frame keeps. floor_px, ceiling_px: limits of what is learned in one frame.
-    Deviation: neither the paper nor the design learns weights; both take fixed ones.
+    Deviation: the paper learns no weights; it takes fixed ones.
     """
 
     sigma_uv_px: dict[str, float] = field(

@@ -83,7 +83,7 @@ class _Guess:
 
 
 class Tracker:
-    """Tracks a camera against a sparse map; step 4 of the design."""
+    """Tracks a camera against a sparse map; step 4."""
 
     def __init__(
         self,

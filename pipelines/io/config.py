@@ -1,6 +1,6 @@
-"""The settings as files: read from YAML and the command line, and written beside each result.
+"""Where settings come from: YAML files and the command line; and the plain form they are kept in.
 
-Owns where a `Config` comes from and how it is kept; the settings' meaning is in `pipelines.config`.
+What they mean is in `pipelines.config`; each result keeps them as config.yaml, see `io.result`.
 """
 
 from __future__ import annotations
@@ -27,16 +27,11 @@ def load_config(path: str | Path | None = None, overrides: Iterable[str] = ()) -
 
 
 def config_to_dict(config: Config) -> dict[str, Any]:
-    """Nested dicts of plain values (numbers, strings, lists), as YAML and JSON hold them."""
+    """Nested dicts of plain values (numbers, strings, lists), as YAML and JSON hold them.
+
+    `load_config` reads a YAML file of them back to an equal `Config`.
+    """
     return cast(dict[str, Any], to_plain(config))
-
-
-def save_config(config: Config, path: str | Path) -> None:
-    """Write every setting as YAML; `load_config` reads it back to an equal `Config`."""
-    import yaml
-
-    text = yaml.safe_dump(config_to_dict(config), sort_keys=False, allow_unicode=True)
-    Path(path).write_text(text, encoding="utf-8")
 
 
 def _read_settings(path: Path) -> dict[str, Any]:

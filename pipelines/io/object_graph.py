@@ -50,7 +50,7 @@ class Store:
         return at
 
     def arrays(self, root: Any = None) -> Arrays:
-        """All of it as two arrays of bytes. root: a value, to be found again by `read_store`."""
+        """All of it as two arrays of bytes. root: a value, which `decode` finds again."""
         tree = json.dumps([root, self.nodes], separators=(",", ":")).encode()
         block = b"".join(self._parts)
         return {_TREE: np.frombuffer(tree, np.uint8), _BYTES: np.frombuffer(block, np.uint8)}

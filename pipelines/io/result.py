@@ -52,11 +52,6 @@ class ResultWriter:
         except OSError as error:
             raise DyObError(disk_error(self.folder, error)) from error
 
-    @property
-    def frames_folder(self) -> Path:
-        """Where annotated frames go."""
-        return self.folder / names.FRAMES
-
     @contextmanager
     def log_to_file(self, level: int = logging.INFO) -> Iterator[None]:
         """Within the block everything logged under "dyob" also goes to run.log."""

@@ -1,6 +1,6 @@
 """What a tracked frame does to the map: refine points, add points, make keyframes, cull.
 
-Owns step 10 of the design, in its order. Storage is `sparse_map`, formulas are `point_filter` and
+Owns step 10 and its order. Storage is `sparse_map`, formulas are `point_filter` and
 `triangulation`.
 """
 

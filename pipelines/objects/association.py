@@ -1,6 +1,6 @@
 """Which detection is which object: flow-carried points vote, filters gate, one assignment decides.
 
-Owns the costs and the Hungarian assignment; step 7 of the design. Knows no images.
+Owns the costs and the Hungarian assignment; step 7. Knows no images.
 
 Deviation: the paper's vote of flow-carried labels forgets an object that is missed once. Objects
 out of sight are looked for where their filter expects them, by place, class and colour.

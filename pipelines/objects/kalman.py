@@ -22,7 +22,7 @@ _SURE_SPEED_MPS = 1.0  # m/s, standard deviation of a speed whose change says so
 
 
 class ObjectFilter:
-    """State (6,): centre in m and velocity in m/s, in the world; step 9 of the design.
+    """State (6,): centre in m and velocity in m/s, in the world; step 9.
 
     center_m: (3,) first seen, with covariance (3, 3). acceleration_mps2: standard deviation of the
     unmodelled acceleration. A new object may move at any speed up to `_FIRST_SPEED_MPS`.

@@ -244,16 +244,6 @@ def fuse_motions(
     )
 
 
-def points_std(covariance: Array, spread_m: Array) -> Array:
-    """How far (...,), in m, motions with covariances (..., 6, 6) may put objects' points wrong.
-
-    spread_m: (...,) root mean square distance of the points from the object's centre. Along the
-    worst direction, of the centre and of what a wrong turn adds.
-    """
-    way, turn = largest_std(covariance[..., 3:, 3:]), largest_std(covariance[..., :3, :3])
-    return np.hypot(way, turn * spread_m)
-
-
 def largest_std(covariance: Array) -> Array:
     """Standard deviations (...,) along the worst direction of covariances (..., 3, 3)."""
     return np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[..., -1], 0.0))

@@ -1,6 +1,6 @@
 """Whether an object moves: the rule in m/s with its uncertainty, and the paper's in m a frame.
 
-Owns the decision and its hysteresis; step 5 of the design. Estimates no motion.
+Owns the decision and its hysteresis; step 5. Estimates no motion.
 """
 
 from __future__ import annotations

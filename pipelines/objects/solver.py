@@ -53,7 +53,7 @@ class Solution:
 
 
 class MotionSolver:
-    """Solves eq. (3) for all objects of a frame; step 8 of the design."""
+    """Solves eq. (3) for all objects of a frame; step 8."""
 
     def __init__(self, sensor: Sensor, config: ObjectsConfig, seed: int) -> None:
         self.sensor, self.config, self.camera, self._seed = sensor, config, sensor.camera, seed

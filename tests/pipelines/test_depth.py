@@ -12,7 +12,7 @@ import pytest
 
 from pipelines.config import DepthConfig
 from pipelines.datasets import open_sequence
-from pipelines.depth import StereoDepth, refine_disparity, to_gray
+from pipelines.depth import StereoDepth, to_gray
 from pipelines.types import StereoCamera
 
 WIDTH, HEIGHT = 320, 160
@@ -157,41 +157,6 @@ def test_unrelated_images_give_next_to_no_depth(stereo: StereoDepth) -> None:
 def test_images_of_another_size_are_refused(stereo: StereoDepth, pair: Pair) -> None:
     with pytest.raises(ValueError, match=r"expected two images of \(160, 320\)"):
         stereo.compute(pair.left[:-1], pair.right[:-1])
-
-
-def test_single_points_are_refined(pair: Pair) -> None:
-    v, u = (grid.ravel() for grid in np.mgrid[10 : HEIGHT - 10 : 9, 40 : WIDTH - 10 : 9])
-    away = cv2.dilate(
-        ((pair.disparity == np.float32(BOARD_PX)) | pair.hidden).astype(np.uint8),
-        np.ones((17, 17), np.uint8),
-    )
-    on_plane = away[v, u] == 0
-    uv = np.stack([u, v], -1)[on_plane].astype(float)
-    truth = pair.disparity[v, u][on_plane].astype(float)
-    start = truth + np.random.default_rng(5).uniform(-0.4, 0.4, len(truth))
-    start[::10] = np.nan
-    refined, ok = refine_disparity(pair.left, pair.right, uv, start)
-    assert len(truth) > 200
-    assert not ok[::10].any()
-    assert ok[np.isfinite(start)].mean() > 0.9
-    error = np.abs(refined - truth)[ok]
-    assert 0.0 < np.median(error) < 0.04  # starts at 0.2
-    assert np.percentile(error, 95) < 0.12
-    # Off the pixel grid as well, and to the same surface.
-    moved = uv[ok] + [0.3, -0.4]
-    there = 4.0 + 0.02 * moved[:, 0] + 0.03 * moved[:, 1]
-    again, still = refine_disparity(pair.left, pair.right, moved, refined[ok])
-    assert np.median(np.abs(again - there)[still]) < 0.05
-
-
-def test_points_that_cannot_be_refined_keep_their_disparity() -> None:
-    flat = np.full((HEIGHT, WIDTH), 90, np.uint8)
-    uv, start = np.array([[50.0, 50.0], [100.0, 60.0]]), np.array([7.3, np.nan])
-    refined, ok = refine_disparity(flat, flat, uv, start)
-    assert not ok.any()
-    np.testing.assert_array_equal(refined, start)
-    none, no = refine_disparity(flat, flat, np.empty((0, 2)), np.empty(0))
-    assert len(none) == len(no) == 0
 
 
 def test_grey_of_rgb() -> None:

@@ -35,7 +35,6 @@ _CLASS_NAMES = {
     "Cyclist": "bicycle", "Pedestrian": "person", "Person": "person", "Person_sitting": "person",
 }  # fmt: skip
 _AHEAD_M, _BEHIND_M = 60.0, 15.0  # of road beyond the ego path
-_EGO_SIZE_M = (1.9, 4.6)
 _MARGIN_M = 45.0  # of ground around everything
 _NEAR_M = 90.0  # things farther from the ego path than this do not widen the ground
 

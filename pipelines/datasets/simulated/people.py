@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from pipelines.datasets.simulated.meshes import Mesh, ellipsoid, limb, merge
 
 Colour = tuple[int, int, int]
@@ -69,10 +67,3 @@ def walker_mesh(clothes: Clothes, height_m: float = 1.74) -> Mesh:
     low, high = mesh.bounds()
     mesh.vertices[:] -= (low + high) / 2
     return mesh
-
-
-def walker_size_m(mesh: Mesh) -> tuple[float, float, float]:
-    """Width, height and depth of a walker's box."""
-    low, high = mesh.bounds()
-    size = np.asarray(high - low)
-    return float(size[0]), float(size[1]), float(size[2])

@@ -60,10 +60,6 @@ class Route(Curve):
         """The other way round: seconds (N,) after which one is at `s` (N,)."""
         return np.asarray(np.interp(s, self._s, self._t))
 
-    def bends_near(self, s: float, reach_m: float) -> bool:
-        """Whether any corner lies within `reach_m` of `s`."""
-        return any(c.s_m - reach_m < s < c.end_m + reach_m for c in self.corners)
-
     def straight_through(
         self, s: Array, lateral: float, joins_m: float, leaves_m: float
     ) -> tuple[Array, Array, Array]:

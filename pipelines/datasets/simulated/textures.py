@@ -1,6 +1,7 @@
 """Surfaces that repeat: asphalt, bricks, wood, foliage, cloth and their like, drawn in numpy.
 
-Owns the `Texture` and the natural materials; windows, shop fronts and cars are in `artwork.py`.
+Owns the `Texture` and natural materials; windows and shop fronts are in `facades`, cars in
+`vehicles`.
 """
 
 from __future__ import annotations

@@ -9,7 +9,8 @@ import yaml
 
 from pipelines.config import Config
 from pipelines.errors import ConfigError
-from pipelines.io.config import config_to_dict, load_config, save_config
+from pipelines.io.config import config_to_dict, load_config
+from pipelines.io.files import write_yaml
 
 
 def test_nothing_given_is_the_defaults() -> None:
@@ -18,7 +19,7 @@ def test_nothing_given_is_the_defaults() -> None:
 
 def test_saved_settings_load_to_an_equal_config(tmp_path: Path) -> None:
     config = load_config(overrides=["orb.n_features=1234", "orb.scale_factor=1.5"])
-    save_config(config, tmp_path / "config.yaml")
+    write_yaml(tmp_path / "config.yaml", config_to_dict(config))
     assert load_config(tmp_path / "config.yaml") == config
     assert config != Config()
 

@@ -13,7 +13,6 @@ from pipelines.objects.motion import (
     fuse_motions,
     motion_in_world,
     move_points,
-    points_std,
     scale_about,
     world_covariance,
 )
@@ -244,10 +243,3 @@ def test_what_is_beyond_the_gate_is_answered_as_measured():
     assert fused.distance2 == pytest.approx(9.0 / 3e-4)
     np.testing.assert_array_equal(fused.H_world_curr_prev, jump)
     np.testing.assert_array_equal(fused.covariance, 2 * small)
-
-
-def test_points_are_put_wrong_by_the_way_and_by_the_turn():
-    covariance = np.diag([0.0, 0.04, 0.01, 0.09, 0.0, 0.01])
-    assert points_std(covariance, 0.0) == pytest.approx(0.3)
-    assert points_std(covariance, 2.0) == pytest.approx(np.sqrt(0.09 + 0.04 * 4.0))
-    assert points_std(np.zeros((6, 6)), 1.0) == 0.0

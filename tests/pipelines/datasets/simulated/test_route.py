@@ -81,5 +81,3 @@ def test_a_corner_is_a_right_angle():
     before, after = (float(route.at(np.array(s), 0.0)[2]) for s in (corner.s_m, corner.end_m))
     assert after - before == pytest.approx(np.pi / 2, abs=1e-6)
     assert corner.end_m - corner.s_m == CORNER_M
-    assert route.bends_near(corner.s_m - 3, 4)
-    assert not route.bends_near(corner.s_m - 5, 4)
