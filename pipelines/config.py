@@ -1,7 +1,7 @@
 """The settings of every step: nested frozen dataclasses, the paper's values where it gives any.
 
-Each step gets its own section only. Owns the values' meaning, ranges and sources. Reading
-them is in `io.config`, merging and type checks in `settings`.
+Each step gets its own section only. Owns the values' meaning, ranges and sources. Reading them is
+in `io.config`, merging and type checks in `settings`.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class MappingConfig:
 
     def __post_init__(self) -> None:
         _check(self, keyframe_min_overlap=(0, 1), keyframe_max_interval=(1, _ANY))
-        _check(self, min_points_apart_px=(0, 100))
+        _check(self, keyframe_min_motion_px=(0, _ANY), min_points_apart_px=(0, 100))
         _check(self, local_keyframes=(1, _ANY), near_keyframe_baselines=(0, _ANY))
         _check(self, min_shared_points=(1, _ANY), min_parallax_deg=(0.01, 90))
         _check(self, max_reprojection_px=(0.1, 50), max_epipolar_px=(0.1, 50))
