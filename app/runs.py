@@ -1,4 +1,4 @@
-"""The verbs that make and read result folders: demo, run, eval, render.
+"""The verbs that make and read result folders: demo, run, eval, optimize, render.
 
 Owns what a person is told about them. The work is in `pipelines` and `viz`.
 """
@@ -120,12 +120,12 @@ def evaluate(arguments: Namespace) -> int:
 def optimize(arguments: Namespace) -> int:
     """`optimize RESULT`: the batch, from what the run recorded; a table of before and after."""
     from pipelines.io.config import load_config
-    from pipelines.io.folder import open_result_folder
+    from pipelines.io.folder import CONFIG, open_result_folder
     from pipelines.io.result import load_result
     from pipelines.optimisation import optimise_result
 
     folder = open_result_folder(arguments.result)
-    own = folder / "config.yaml"
+    own = folder / CONFIG
     path = arguments.config or (own if own.exists() else None)
     config = load_config(path, arguments.overrides)
     counting = console.counting("optimising", arguments.quiet)

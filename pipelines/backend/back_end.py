@@ -40,7 +40,7 @@ _log = logging.getLogger("dyob.backend")
 
 
 class BackEnd:
-    """Improves the latest keyframes and their points while tracking goes on.
+    """Improves the map while tracking goes on: its latest part, and all of it where a loop closes.
 
     worker: where the work is done; by default as the settings say.
     """

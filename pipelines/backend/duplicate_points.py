@@ -33,7 +33,7 @@ Pairs = NDArray[np.int64]  # (P, 2) of point ids: the old one, and its double
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """A recent keyframe: the points that it sees, and where they are. Ts: T_world_camera (4, 4)."""
+    """A recent keyframe: its T_world_camera (4, 4), the points that it sees, and where they are."""
 
     T: Array
     ids: Index
