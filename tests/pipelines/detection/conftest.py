@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.detection.coco import COCO_80
 from pipelines.types import Frame
 
 RED = (slice(20, 61), slice(30, 91))  # rows and columns of the red rectangle
@@ -141,7 +140,3 @@ def make_mask_rcnn(tmp_path: Path) -> Callable[..., Path]:
         return _save(tmp_path / "mask_rcnn.onnx", nodes, inputs, outputs, None)
 
     return make
-
-
-def coco_index(name: str) -> int:
-    return COCO_80.index(name)

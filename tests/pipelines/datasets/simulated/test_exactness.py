@@ -4,8 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-INTERIOR = 3  # pixels from the border
-
 
 def grid(camera):
     return np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
