@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +21,12 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def pytest_configure() -> None:
-    """An empty models' folder, in child processes too, before any test looks for one."""
+    """An empty models' folder, in child processes too, before any test looks for one; and Ctrl-C.
+
+    A shell's background job is started deaf to it, and so would be all programs that tests start.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ["DYOB_MODELS"] = tempfile.mkdtemp(prefix="dyob-test-models-")
 
 

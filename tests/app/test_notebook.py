@@ -98,7 +98,10 @@ def test_the_address_that_it_prints_opens_and_ctrl_c_ends_it(tmp_path: Path) -> 
             assert status(f"{contents}?{parts.query}") == 200
         finally:
             running.send_signal(signal.SIGINT)
-        assert running.wait(timeout=60) == 0
+        try:
+            assert running.wait(timeout=60) == 0
+        finally:
+            running.terminate()
     with pytest.raises(urllib.error.URLError):
         status(contents)
     assert "Traceback" not in (tmp_path / "log").read_text()

@@ -5,8 +5,7 @@ Owns the folders' writing, and sequences that alter frames on their way. Rendere
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -121,14 +120,6 @@ def paste_board(
             Frame(k, 0.1 * k, image, None, depth, flow if k > 0 else None, labels, {5: "car"})
         )
     return frames
-
-
-@pytest.fixture
-def hears_ctrl_c() -> Iterator[None]:
-    """A background job is started deaf to it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

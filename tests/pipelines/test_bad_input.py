@@ -23,16 +23,10 @@ from tests.pipelines.damage import blacken, camera_errors_m, rewrite
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# A shell's background job is started deaf to Ctrl-C, and so would be all that it starts
-HEARS_CTRL_C = (
-    "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    "from app.__main__ import main; sys.exit(main(sys.argv[1:]))"
-)
-
 
 def start_app(*words: str | Path) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-c", HEARS_CTRL_C, *map(str, words)],
+        [sys.executable, "-m", "app", *map(str, words)],
         cwd=ROOT,
         env={**os.environ, "DYOB_NO_SETUP": "1"},
         stdout=subprocess.PIPE,

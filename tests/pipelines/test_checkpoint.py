@@ -17,8 +17,6 @@ from pipelines.runner import run
 from pipelines.types import Frame
 from tests.pipelines.interruption import QUICK, Interrupter
 
-pytestmark = pytest.mark.usefixtures("hears_ctrl_c")
-
 
 def test_a_finished_run_says_so_and_is_left_alone(short_street, tmp_path, caplog) -> None:
     config = load_config(None, QUICK)

@@ -32,7 +32,6 @@ from pipelines.types import Frame
 from tests.pipelines.interruption import QUICK, Interrupter
 from viz.overlay import FrameWriter
 
-pytestmark = pytest.mark.usefixtures("hears_ctrl_c")
 ROOT = Path(__file__).resolve().parents[2]
 WITH_TIMES = ("run.log", "timings.json", "metrics.txt")  # beside the batch's, in metrics.json
 
