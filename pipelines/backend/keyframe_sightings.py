@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipelines.backend.batch_problem import choose_longest, weigh
 from pipelines.backend.point_tracks import Index, PointTracks
-from pipelines.frontend.disparity_offset import offset_share
+from pipelines.frontend.disparity_offset import corrected
 from pipelines.frontend.sensor import Sensor
 from pipelines.mapping.sparse_map import SparseMap
 from pipelines.types import Array, StereoCamera
@@ -57,9 +57,7 @@ def copy_sightings(
     ids = np.concatenate([k.tracks.point_ids for k in chosen])
     keep = wanted[ids]
     disparity_px = [
-        k.tracks.disparity_px
-        + (offset_px - k.disparity_offset_px)
-        * offset_share(sparse_map.camera, k.tracks.disparity_px)
+        corrected(sparse_map.camera, k.tracks.disparity_px, offset_px - k.disparity_offset_px)
         for k in chosen
     ]
     return KeyframeSightings(

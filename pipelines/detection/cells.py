@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.frontend.disparity_offset import corrected
 from pipelines.types import Array, StereoCamera
 
 _MIN_KNOWN = 0.4  # share of a cell's pixels that must have a disparity
@@ -71,9 +72,9 @@ class DepthCells:
     disparity_px: Floats
     edge: Bools
 
-    def shifted(self, offset_px: float) -> DepthCells:
-        """The same with `offset_px` added to all disparities."""
-        return DepthCells(self.disparity_px + np.float32(offset_px), self.edge)
+    def corrected(self, camera: StereoCamera, offset_px: float) -> DepthCells:
+        """The same with disparities as a learned offset has them."""
+        return DepthCells(corrected(camera, self.disparity_px, offset_px), self.edge)
 
 
 def reduce_disparity(grid: CellGrid, disparity_px: Floats, sigma_px: float) -> DepthCells:

@@ -23,8 +23,9 @@ from pipelines.detection.cells import (
     sample,
     static_places,
 )
+from pipelines.frontend.disparity_offset import corrected
 from pipelines.geometry import invert_T, rotation_angle_deg
-from pipelines.types import Array
+from pipelines.types import Array, StereoCamera
 
 _MEMORY_KEYFRAMES = 20  # as many as DynaSLAM keeps
 _MEMORY_RECENT = 8
@@ -44,11 +45,12 @@ class Reference:
     nearest_px: Floats
     farthest_px: Floats
 
-    def shifted(self, offset_px: float) -> Reference:
-        """The same with `offset_px` added to all disparities."""
-        offset = np.float32(offset_px)
+    def corrected(self, camera: StereoCamera, offset_px: float) -> Reference:
+        """The same with disparities as a learned offset has them."""
         return replace(
-            self, nearest_px=self.nearest_px + offset, farthest_px=self.farthest_px + offset
+            self,
+            nearest_px=corrected(camera, self.nearest_px, offset_px),
+            farthest_px=corrected(camera, self.farthest_px, offset_px),
         )
 
 

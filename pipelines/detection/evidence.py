@@ -42,6 +42,7 @@ _SURE_SIGMAS = 2.5  # of a region's motion beyond the least that counts
 class Evidence:
     """One frame's cells, all (h, w).
 
+    measured: cells as they were before the learned offset of disparities came in.
     flow: residuals against the frame before, or None. comparisons: with older views. usable:
     near enough, above the ground. images: (H, W) grey, smoothed, of this frame and
     the one before, or None. dt_s: time since the frame before. sigma_px: of a cell's
@@ -50,6 +51,7 @@ class Evidence:
 
     grid: CellGrid
     cells: DepthCells
+    measured: DepthCells
     flow: FlowResiduals | None
     comparisons: list[Comparison]
     usable: Bools

@@ -126,7 +126,7 @@ class MultiViewGeometry:
         sigma = view.sigma_disparity_px
         measured = reduce_disparity(grid, view.disparity_px, sigma)
         offset = view.disparity_offset_px
-        cells = measured.shifted(offset)
+        cells = measured.corrected(self.camera, offset)
         usable = cells.disparity_px > self.camera.bf / config.max_range_m
         self._ground = fit_ground(grid, cells.disparity_px, self._ground, sigma)
         if self._ground is not None:
@@ -134,7 +134,7 @@ class MultiViewGeometry:
             usable &= height > config.ground_clearance_m
         pose = (view.timestamp_s, view.T_world_camera)
         comparisons: list[Comparison] = [
-            compare(grid, cells, reference.shifted(offset), pose, sigma, config)
+            compare(grid, cells, reference.corrected(self.camera, offset), pose, sigma, config)
             for reference in self._memory.overlapping(*pose)
         ]
         flow, dt_s = None, 0.1
@@ -148,7 +148,7 @@ class MultiViewGeometry:
                 flow = flow_residuals(
                     grid,
                     cells,
-                    cells_before.shifted(offset),
+                    cells_before.corrected(self.camera, offset),
                     static_places(grid, cells.disparity_px, T_last_this),
                     view.flow_prev_to_curr_px,
                     (max(view.sigma_flow_px, config.flow_sigma_px), sigma),
@@ -157,11 +157,13 @@ class MultiViewGeometry:
                     config,
                 )
         self._last_smooth = smooth
-        return Evidence(grid, cells, flow, comparisons, usable, images, dt_s, sigma, config)
+        return Evidence(
+            grid, cells, measured, flow, comparisons, usable, images, dt_s, sigma, config
+        )
 
     def _remember(self, view: GeometryView, evidence: Evidence, instances: list[_Instance]) -> None:
         """Keep the view for later ones; what moves in it is left out, as it will be elsewhere."""
-        measured = evidence.cells.shifted(-view.disparity_offset_px)
+        measured = evidence.measured
         moving = np.zeros(self._grid.shape, np.uint8)
         for instance in instances:
             if instance.motion is not None:
@@ -305,7 +307,7 @@ class MultiViewGeometry:
             window, pixels = paint(
                 self._grid,
                 instance.cells,
-                evidence.cells.disparity_px - np.float32(view.disparity_offset_px),
+                evidence.measured.disparity_px,
                 view.disparity_px,
                 self.config.depth_gap_share,
             )

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.frame_observations import FrameObservations
 from pipelines.frontend.motion_only_ba import observation_covariance, whitening
@@ -46,20 +47,24 @@ def offset_share(camera: StereoCamera, disparity_px: Array) -> Array:
     return 1.0 - np.float32(_TARGET_BASELINES / camera.fx) * disparity_px
 
 
+def corrected(camera: StereoCamera, disparity_px: NDArray, offset_px: float) -> NDArray:
+    """Disparities of any shape with their share of an offset added; infinite ones stay so."""
+    share = offset_share(camera, np.where(np.isinf(disparity_px), 0.0, disparity_px))
+    return disparity_px + (offset_px * share).astype(disparity_px.dtype)
+
+
 def with_last_offset(
     camera: StereoCamera, log: Sequence[FrameObservations]
 ) -> list[FrameObservations]:
     """The log of a run with all disparities as the offset was known at its end."""
     last = log[-1].disparity_offset_px if log else 0.0
-    corrected = []
+    entries = []
     for entry in log:
         step = last - entry.disparity_offset_px
         disparity = entry.sightings.disparity_px
-        sightings = replace(
-            entry.sightings, disparity_px=disparity + step * offset_share(camera, disparity)
-        )
-        corrected.append(replace(entry, sightings=sightings, disparity_offset_px=last))
-    return corrected
+        sightings = replace(entry.sightings, disparity_px=corrected(camera, disparity, step))
+        entries.append(replace(entry, sightings=sightings, disparity_offset_px=last))
+    return entries
 
 
 class DisparityOffset:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipelines.depth import to_gray
 from pipelines.errors import FrameError
-from pipelines.frontend.disparity_offset import offset_share
+from pipelines.frontend.disparity_offset import corrected
 from pipelines.frontend.orb import OrbExtractor
 from pipelines.frontend.sampling import sample_disparity
 from pipelines.object_types import Detections
@@ -177,8 +177,7 @@ def complete_view(
     """
     disparity, features = prepared.disparity_px, prepared.features
     if disparity_offset_px != 0.0:
-        share = offset_share(camera, disparity)
-        disparity = disparity + np.float32(disparity_offset_px) * share
+        disparity = corrected(camera, disparity, disparity_offset_px)
     disparity_at = sample_disparity(disparity, features.uv_px, sigma_disparity_px)
     with np.errstate(divide="ignore", invalid="ignore"):
         features = features.with_depth(np.where(disparity_at > 0, camera.bf / disparity_at, np.nan))

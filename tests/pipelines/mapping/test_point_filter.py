@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from pipelines.frontend.disparity_offset import corrected, offset_share
 from pipelines.geometry import (
     backproject,
     exp_se3,
@@ -213,11 +214,13 @@ def test_sensitivities_say_how_points_move_with_a_disparity_offset():
     sigma, h = np.full(60, SIGMA_DISPARITY_PX), 1e-3
 
     def run(offset_px):
-        uv, disparity = seen[0][0], seen[0][1] + offset_px
+        uv, disparity = seen[0][0], corrected(CAMERA, seen[0][1], offset_px)
         points, P = make_points(CAMERA, Ts[0], uv, disparity, SIGMA_UV_PX, sigma)
         slopes = (Ts[0][:3, 3] - points) / disparity[:, None]
-        for T, (uv, disparity) in zip(Ts[1:], seen[1:], strict=True):
-            observations = observations_of(points, P, uv, disparity + offset_px)
+        slopes *= offset_share(CAMERA, disparity)[:, None]
+        for T, (uv, measured) in zip(Ts[1:], seen[1:], strict=True):
+            now = corrected(CAMERA, measured, offset_px)
+            observations = observations_of(points, P, uv, now)
             points, P, slopes = refine_points(CAMERA, T, NO_POSE_ERROR, observations, slopes)
         return points, slopes
 
