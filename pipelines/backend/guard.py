@@ -25,8 +25,8 @@ _RULED_OUT = 5.0 * 22.5
 _WILD_MPS = 1.0  # apart in speed, it is ruled out by the front-end's covariance alone
 _BEHIND = 100.0  # squared standard deviations that a point behind the camera counts as
 _TOLERANCE = 1.002  # of an error, up to which it is as good as before
-_MOST_HANDICAP = 0.1
 _SIGNIFICANT = 1.0  # standard deviations of the growth, below which it may be chance
+_MIN_HELD_OUT = 5  # sightings, fewer of which say nothing of an object
 CAMERA = 0  # body of the static world
 
 
@@ -35,9 +35,10 @@ class Verdict:
     """Held-out errors of one body, in standard deviations (RMS), before and after the batch.
 
     object_id: 0 for the static world, by which the cameras are judged. n_held_out: sightings behind
-    it; without any there is nothing to object to. worse_by: mean growth of their squared errors,
-    in that mean's own standard deviations. is_binding: whether the batch is refused by it.
-    handicap: share of `before` by which it is too small, as the front-end was shown them.
+    it. Where they are few, nothing objects to the cameras, and nothing speaks for an object.
+    worse_by: mean growth of their squared errors, in that mean's own standard deviations.
+    is_binding: whether the batch is refused by it. handicap: share of `before` by which it is too
+    small, as the front-end was shown them.
     """
 
     object_id: int
@@ -51,12 +52,12 @@ class Verdict:
     @property
     def accepted(self) -> bool:
         """Whether the batch made it no worse, or nobody minds."""
-        return (
-            not self.is_binding
-            or self.n_held_out == 0
-            or self.after <= _TOLERANCE * (1.0 + self.handicap) * self.before
-            or self.worse_by < _SIGNIFICANT
-        )
+        if not self.is_binding:
+            return True
+        if self.n_held_out < _MIN_HELD_OUT:
+            return self.object_id == CAMERA
+        allowed = _TOLERANCE * (1.0 + self.handicap) * self.before
+        return self.after <= allowed or self.worse_by < _SIGNIFICANT
 
 
 def judge(
@@ -66,13 +67,11 @@ def judge(
 
     before, after: the same problem at the front-end's answer and at the batch's. Points settle for
     each, as the front-end's own are those that its filter had at the end of their tracks. Its poses
-    were fitted to the held-out sightings, too: six numbers of a pose fit a share of the noise.
+    were fitted to the held-out sightings, too: the six numbers of a camera fit some of the noise.
     """
     errors = [_errors(problem, held) for problem in (before, after)]
-    owner_of_body = np.array([CAMERA, *(s.object_id for s in before.stretches)])
-    owner = owner_of_body[before.body_of_view[held.view]]
-    owner_of_view = owner_of_body[before.body_of_view]
-    n_numbers = _n_numbers(before, held)
+    body = before.body_of_view[held.view]
+    owner = np.array([CAMERA, *(s.object_id for s in before.stretches)])[body]
     verdicts = []
     for object_id in np.unique([CAMERA, *(s.object_id for s in before.stretches)]):
         own = owner == object_id
@@ -81,8 +80,9 @@ def judge(
             verdicts.append(Verdict(int(object_id), 0, np.nan, np.nan, np.nan, is_binding))
             continue
         sizes = [float(np.sqrt(e[own].mean())) for e in errors]
-        views = owner_of_view == object_id
-        handicap = min(6.0 * int(views.sum()) / n_numbers[views].sum(), _MOST_HANDICAP)
+        handicap = 0.0  # of objects few sightings are held out: there doubt is for the front-end
+        if object_id == CAMERA:
+            handicap = 6.0 * before.n_frames / _n_numbers(before, held)
         growth = errors[1][own] - (1.0 + handicap) ** 2 * errors[0][own]
         chance = float(growth.std() / np.sqrt(n))
         worse_by = float(growth.mean()) / max(chance, 1e-12)
@@ -92,11 +92,12 @@ def judge(
     return tuple(verdicts)
 
 
-def _n_numbers(problem: BatchProblem, held: HeldOut) -> NDArray[np.int64]:
-    """(V,) how many numbers the front-end has seen in each view, those held out among them."""
-    n = np.zeros(problem.tracks.n_views, np.int64)
+def _n_numbers(problem: BatchProblem, held: HeldOut) -> int:
+    """How many numbers the front-end has seen of the static world, those held out among them."""
+    n = 0
     for seen in (problem.tracks, held):
-        np.add.at(n, seen.view, 2 + np.isfinite(seen.disparity_px))
+        static = seen.view < problem.n_frames
+        n += int((2 + np.isfinite(seen.disparity_px[static])).sum())
     return n
 
 
