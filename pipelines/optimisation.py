@@ -23,6 +23,7 @@ from pipelines.backend.batch_outcome import (
     trajectory_after,
 )
 from pipelines.backend.global_batch import BatchResult, run_global_batch
+from pipelines.backend.guard import MIN_HELD_OUT
 from pipelines.backend.partial_batch import run_partial_batch
 from pipelines.backend.point_motion_batch import run_point_motion_batch
 from pipelines.config import BatchConfig
@@ -210,6 +211,12 @@ def _tell(result: BatchResult | None, block: dict[str, Any]) -> None:
         if verdict.accepted:
             continue
         what = f"object {verdict.object_id}" if verdict.object_id else "the camera"
+        if verdict.n_held_out < MIN_HELD_OUT:
+            _log.info(
+                "batch not believed for %s: %d held-out sightings are too few to judge it; the "
+                "front-end's answer is kept", what, verdict.n_held_out,
+            )  # fmt: skip
+            continue
         _log.info(
             "batch refused for %s: held-out error %.3f before, %.3f after; the front-end's "
             "answer is kept", what, verdict.before, verdict.after,

@@ -26,7 +26,7 @@ _WILD_MPS = 1.0  # apart in speed, it is ruled out by the front-end's covariance
 _BEHIND = 100.0  # squared standard deviations that a point behind the camera counts as
 _TOLERANCE = 1.002  # of an error, up to which it is as good as before
 _SIGNIFICANT = 1.0  # standard deviations of the growth, below which it may be chance
-_MIN_HELD_OUT = 5  # sightings, fewer of which say nothing of an object
+MIN_HELD_OUT = 5  # sightings, fewer of which say nothing of an object
 CAMERA = 0  # body of the static world
 
 
@@ -54,7 +54,7 @@ class Verdict:
         """Whether the batch made it no worse, or nobody minds."""
         if not self.is_binding:
             return True
-        if self.n_held_out < _MIN_HELD_OUT:
+        if self.n_held_out < MIN_HELD_OUT:
             return self.object_id == CAMERA
         allowed = _TOLERANCE * (1.0 + self.handicap) * self.before
         return self.after <= allowed or self.worse_by < _SIGNIFICANT

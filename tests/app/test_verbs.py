@@ -161,8 +161,12 @@ def test_bad_input_is_code_2_and_a_sentence(words: list[str], sentence: str) -> 
     assert "Traceback" not in done.stderr
 
 
-def test_optimize_starts_from_the_front_end_however_often(result: Path) -> None:
+def test_optimize_starts_from_the_front_end_however_often(tmp_path: Path) -> None:
     """The run's own batch and two more give the same; the front-end's answers stay beside."""
+    result = tmp_path / "worn"  # where there is something to make better
+    how = ("--degrade", "--frames", N_FRAMES, "--pictures", 0, "--output", result, "--quiet")
+    run = app("run", "simulated:demo", *how)
+    assert run.returncode == 0, run.stdout + run.stderr
     kept = (result / "front_end" / "camera_tum.txt").read_text()
     by_run = (result / "camera_tum.txt").read_text()
     assert by_run != kept
