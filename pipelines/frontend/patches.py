@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pipelines.frontend.sampling import disparity_slopes
 from pipelines.frontend.view import View
 from pipelines.geometry import invert_T
+from pipelines.observations import Tracks
 from pipelines.types import Array, Image, StereoCamera
 
 SIDE_PX = 21  # the window of the alignment, its gradients, and the fraction of the point's pixel
@@ -28,6 +29,19 @@ _TOO_FAR = 2.0  # times beyond these, a patch is of no use at all
 _PIXELS = np.stack(
     [g.ravel() for g in np.meshgrid(np.arange(SIDE_PX), np.arange(SIDE_PX))] + [np.ones(SIDE_PX**2)]
 ).astype(np.float32)  # (3, 441) homogeneous pixels of a patch
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """A view that patches are cut from, with its T_world_camera (4, 4).
+
+    sigma_disparity_px: noise of its disparities.
+    """
+
+    camera: StereoCamera
+    view: View
+    T_world_camera: Array
+    sigma_disparity_px: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,37 +137,26 @@ class Patches:
         return warped.reshape(n, SIDE_PX, SIDE_PX)
 
 
-def renew_patches(
-    old: Patches,
-    camera: StereoCamera,
-    view: View,
-    T_world_camera: Array,
-    point_ids: NDArray[np.int64],
-    uv_px: Array,
-    depth_m: Array,
-    sigma_disparity_px: float,
-) -> Patches:
-    """Patches of the points (N,) that are tracked on: the old ones while they fit, else new ones.
+def renew_patches(old: Patches, shot: Shot, tracks: Tracks, depth_m: Array) -> Patches:
+    """Patches of the points that are tracked on: the old ones while they fit, else new ones.
 
-    view: in which they are at uv_px (N, 2) and depth_m (N,) away, from T_world_camera (4, 4).
+    tracks: N points as the shot sees them, depth_m (N,) away from its camera.
     """
-    order = np.argsort(point_ids, kind="stable")
-    ids, uv, depth = point_ids[order], uv_px[order], depth_m[order]
-    rows = old.rows(ids)
+    order = np.argsort(tracks.point_ids, kind="stable")
+    tracks, depth_m = tracks[order], depth_m[order]
+    rows = old.rows(tracks.point_ids)
     fits = rows >= 0
-    Hs = old.homographies(camera, rows[fits], T_world_camera)
+    Hs = old.homographies(shot.camera, rows[fits], shot.T_world_camera)
     growth = _growth(Hs, old.uv_px[rows[fits]])
     fits[fits] = (growth > _MIN_GROWTH) & (growth < _MAX_GROWTH)
-    new = _cut_patches(
-        camera, view, T_world_camera, ids[~fits], uv[~fits], depth[~fits], sigma_disparity_px
-    )
-    both = np.concatenate([ids[fits], ids[~fits]]).argsort(kind="stable")
+    new = _cut_patches(shot, tracks[~fits], depth_m[~fits])
+    both = np.concatenate([np.flatnonzero(fits), np.flatnonzero(~fits)]).argsort(kind="stable")
 
     def join(kept: NDArray, fresh: NDArray) -> NDArray:
         return np.concatenate([kept[rows[fits]], fresh])[both]
 
     return Patches(
-        ids,
+        tracks.point_ids,
         join(old.pixels, new.pixels),
         join(old.corner_px, new.corner_px),
         join(old.uv_px, new.uv_px),
@@ -162,28 +165,21 @@ def renew_patches(
     )
 
 
-def _cut_patches(
-    camera: StereoCamera,
-    view: View,
-    T_world_camera: Array,
-    point_ids: NDArray[np.int64],
-    uv_px: Array,
-    depth_m: Array,
-    sigma_disparity_px: float,
-) -> Patches:
+def _cut_patches(shot: Shot, tracks: Tracks, depth_m: Array) -> Patches:
+    view, bf, uv_px = shot.view, shot.camera.bf, tracks.uv_px
     H, W = view.gray.shape
     corner = np.floor(uv_px).astype(np.int64) - _HALF
     x = np.clip(corner[:, :1] + np.arange(SIDE_PX), 0, W - 1)
     y = np.clip(corner[:, 1:] + np.arange(SIDE_PX), 0, H - 1)
-    slopes = disparity_slopes(view.disparity_px, uv_px, sigma_disparity_px)
-    at_origin = camera.bf / depth_m - (slopes * uv_px).sum(axis=1)
+    slopes = disparity_slopes(view.disparity_px, uv_px, shot.sigma_disparity_px)
+    at_origin = bf / depth_m - (slopes * uv_px).sum(axis=1)
     return Patches(
-        point_ids,
+        tracks.point_ids,
         view.gray[y[:, :, None], x[:, None, :]],
         corner,
         uv_px,
-        np.column_stack([slopes, at_origin]) / camera.bf,
-        np.tile(T_world_camera, (len(uv_px), 1, 1)),
+        np.column_stack([slopes, at_origin]) / bf,
+        np.tile(shot.T_world_camera, (len(uv_px), 1, 1)),
     )
 
 

@@ -28,7 +28,7 @@ from pipelines.frontend.measurement import (
     search_local_map,
 )
 from pipelines.frontend.motion_only_ba import PoseEstimate, estimate_camera_pose
-from pipelines.frontend.patches import Patches, renew_patches
+from pipelines.frontend.patches import Patches, Shot, renew_patches
 from pipelines.frontend.rgbd_odometry import estimate_rgbd_odometry
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
@@ -114,16 +114,10 @@ class Tracker:
     ) -> None:
         """Keep what the next frame will be tracked from: a view from (4, 4), and what it saw."""
         points = sparse_map.position_m[tracks.point_ids]
-        patches = renew_patches(
-            Patches.empty() if self._last is None else self._last.patches,
-            self.camera,
-            view,
-            T_world_camera,
-            tracks.point_ids,
-            tracks.uv_px,
-            transform_points(invert_T(T_world_camera), points)[:, 2],
-            self.noise.sigma_disparity_px,
-        )
+        depth_m = transform_points(invert_T(T_world_camera), points)[:, 2]
+        shot = Shot(self.camera, view, T_world_camera, self.noise.sigma_disparity_px)
+        old = Patches.empty() if self._last is None else self._last.patches
+        patches = renew_patches(old, shot, tracks, depth_m)
         self._last = LastFrame(view, tracks, patches=patches)
 
     def forget_flow(self) -> None:

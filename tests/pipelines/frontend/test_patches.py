@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from pipelines.frontend.alignment import align_patches
-from pipelines.frontend.patches import SIDE_PX, Patches, renew_patches
+from pipelines.frontend.patches import SIDE_PX, Patches, Shot, renew_patches
 from pipelines.frontend.view import View
 from pipelines.geometry import exp_se3, invert_T, project_stereo, transform_points
+from pipelines.observations import Tracks
 from pipelines.types import Features, StereoCamera
 
 W, H = 400, 300
@@ -59,7 +60,8 @@ def cut(view, uv, depth, old=None, T=None, ids=None):
     ids = np.arange(len(uv)) if ids is None else ids
     T = np.eye(4) if T is None else T
     old = Patches.empty() if old is None else old
-    return renew_patches(old, CAMERA, view, T, ids, uv, depth, SIGMA_PX)
+    tracks = Tracks(ids, uv, CAMERA.bf / depth, np.full(len(uv), 0.1))
+    return renew_patches(old, Shot(CAMERA, view, T, SIGMA_PX), tracks, depth)
 
 
 def true_pixels(uv, depth, T):
