@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from pipelines.backend.batch_problem import BatchProblem
 from pipelines.backend.held_out import HeldOut, held_out_errors
-from pipelines.backend.point_elimination import evaluate, settle_points
+from pipelines.backend.misfit import squared_misfits
+from pipelines.backend.point_elimination import settle_points
 from pipelines.geometry import invert_T, orthonormalise
 from pipelines.object_types import ObjectEstimates
 from pipelines.objects.motion import displacement, fuse_motions
@@ -23,7 +24,6 @@ from pipelines.types import Array
 # motions of simulated sequences, none that the batch made better comes near both
 _RULED_OUT = 5.0 * 22.5
 _WILD_MPS = 1.0  # apart in speed, it is ruled out by the front-end's covariance alone
-_BEHIND = 100.0  # squared standard deviations that a point behind the camera counts as
 _TOLERANCE = 1.002  # of an error, up to which it is as good as before
 _SIGNIFICANT = 1.0  # standard deviations of the growth, below which it may be chance
 MIN_HELD_OUT = 5  # sightings, fewer of which say nothing of an object
@@ -67,22 +67,22 @@ def judge(
 
     before, after: the same problem at the front-end's answer and at the batch's. Points settle for
     each, as the front-end's own are those that its filter had at the end of their tracks. Its poses
-    were fitted to the held-out sightings, too: the six numbers of a camera fit some of the noise.
+    were fitted to the held-out sightings, too: the six numbers of a pose fit some of the noise.
     """
     errors = [_errors(problem, held) for problem in (before, after)]
-    body = before.body_of_view[held.view]
-    owner = np.array([CAMERA, *(s.object_id for s in before.stretches)])[body]
+    owner_of_view = np.array([CAMERA, *(s.object_id for s in before.stretches)])[
+        before.body_of_view
+    ]
     verdicts = []
-    for object_id in np.unique([CAMERA, *(s.object_id for s in before.stretches)]):
-        own = owner == object_id
+    for object_id in np.unique(owner_of_view):
+        own = owner_of_view[held.view] == object_id
         n = int(own.sum())
         if n == 0:
             verdicts.append(Verdict(int(object_id), 0, np.nan, np.nan, np.nan, is_binding))
             continue
         sizes = [float(np.sqrt(e[own].mean())) for e in errors]
-        handicap = 0.0  # of objects few sightings are held out: there doubt is for the front-end
-        if object_id == CAMERA:
-            handicap = 6.0 * before.n_frames / _n_numbers(before, held)
+        n_poses = int((owner_of_view == object_id).sum())
+        handicap = 6.0 * n_poses / _n_numbers(before, held, owner_of_view == object_id)
         growth = errors[1][own] - (1.0 + handicap) ** 2 * errors[0][own]
         chance = float(growth.std() / np.sqrt(n))
         worse_by = float(growth.mean()) / max(chance, 1e-12)
@@ -92,12 +92,12 @@ def judge(
     return tuple(verdicts)
 
 
-def _n_numbers(problem: BatchProblem, held: HeldOut) -> int:
-    """How many numbers the front-end has seen of the static world, those held out among them."""
+def _n_numbers(problem: BatchProblem, held: HeldOut, views: NDArray[np.bool_]) -> int:
+    """How many numbers the front-end has measured in some views (V,), those held out among them."""
     n = 0
     for seen in (problem.tracks, held):
-        static = seen.view < problem.n_frames
-        n += int((2 + np.isfinite(seen.disparity_px[static])).sum())
+        own = views[seen.view]
+        n += int((2 + np.isfinite(seen.disparity_px[own])).sum())
     return n
 
 
@@ -117,7 +117,7 @@ def misfit_motions(
     view = before.tracks.view - before.n_frames
     on_object = view >= 0
     for problem, sign in ((before, -1.0), (after, 1.0)):
-        squares = _squares(problem)[on_object]
+        squares = squared_misfits(problem)[on_object]
         growth += sign * np.bincount(view[on_object], squares, n)
     found: NDArray[np.bool_] = np.zeros(n, bool)
     told = _front_end_motions(before, after)
@@ -149,18 +149,6 @@ def _front_end_motions(before: BatchProblem, after: BatchProblem) -> Array:
         steps = L[1:] @ invert_T(L[:-1])
         Hs[stretch.first_pose + 1 : stretch.poses.stop] = moved[1:] @ steps @ invert_T(moved[:-1])
     return Hs
-
-
-def _squares(problem: BatchProblem) -> Array:
-    """(N,) squared whitened residuals under Huber's kernel, with points settled for the poses."""
-    views = problem.views(problem.Ts_world_camera, problem.Ts_world_object)
-    points = settle_points(problem.camera, problem.tracks, views, problem.points_m)
-    every = np.ones(len(problem.tracks), bool)
-    seen = evaluate(problem.camera, problem.tracks, views, points, every, every)
-    w_uv, w_disparity = seen.weight_uv, seen.weight_disparity
-    squares = (seen.uv**2).sum(1) * w_uv * (2.0 - w_uv)
-    squares += seen.disparity**2 * w_disparity * (2.0 - w_disparity)
-    return np.where(w_uv > 0.0, squares, _BEHIND)
 
 
 def keep_motions(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.evaluation.object_matching import box_areas_px
+from pipelines.geometry import rotation_angle_deg
 from pipelines.types import Array, ObjectTruth
 
 KMH = 3.6  # km/h in 1 m/s
@@ -23,7 +24,8 @@ class ObjectLimits:
     min_overlap: float = 0.3  # of boxes that show the same object
     min_pixels: int = 150  # seen of an object; of its box where the truth has no masks
     max_distance_m: float = 25.0  # from the camera to the object's origin
-    still_kmh: float = 0.5  # slower truth stands still
+    still_kmh: float = 0.5  # slower truth stands still, unless it turns
+    still_dps: float = 20.0  # deg/s, slower turning may be the labels' noise
     moving_kmh: float = 3.0  # faster truth should be found moving (coverage)
 
 
@@ -86,7 +88,11 @@ def true_steps(truth: ObjectTruth, frames: RunFrames, limits: ObjectLimits) -> T
     distance_m[run] = np.linalg.norm(position[run] - camera_m, axis=1)
     size = box_areas_px(truth.boxes_px) if truth.n_pixels is None else truth.n_pixels
     is_judged = np.isfinite(truth.boxes_px).all(1) & (size >= limits.min_pixels)
-    is_moving = truth.moving & (speed_kmh >= limits.still_kmh)
+    turn_deg = np.zeros(len(truth))
+    Rs = truth.Ts_world_object[:, :3, :3]
+    turn_deg[known] = rotation_angle_deg(np.swapaxes(Rs[previous[known]], 1, 2) @ Rs[known])
+    turns = turn_deg / dt_s >= limits.still_dps
+    is_moving = truth.moving & ((speed_kmh >= limits.still_kmh) | turns)
     is_near = is_judged & (distance_m < limits.max_distance_m)
     return TrueSteps(
         previous,

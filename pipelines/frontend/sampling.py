@@ -7,6 +7,8 @@ rejection of outliers are what keeps such mixtures out.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,13 +67,38 @@ def disparity_slopes(disparity_px: NDArray[np.float32], uv_px: Array, sigma_px: 
     return np.nan_to_num(_fit_planes(disparity_px, uv_px, sigma_px, 2)[:, 1:])
 
 
-def _fit_planes(
-    disparity_px: NDArray[np.float32], uv_px: Array, sigma_px: float, spread: int
-) -> Array:
-    """(N, 3) disparity and its slopes at places (N, 2), NaN where too few pixels lie on a plane.
+def edge_share(disparity_px: NDArray[np.float32], uv_px: Array, sigma_px: float) -> Array:
+    """Share (N,) of the known surroundings of places (N, 2) that lie across a depth edge.
 
-    spread: px, from one to the next of the 5 x 5 pixels.
+    By every fourth pixel of 17 x 17, the window of an alignment: what lies across moves otherwise,
+    and drags the aligned place along.
     """
+    if len(uv_px) == 0:
+        return np.empty(0)
+    window = _read_windows(disparity_px, uv_px, sigma_px, 4)
+    known = np.isfinite(window.off_median_px)
+    across = np.count_nonzero(known & ~window.on_plane, axis=1)
+    return across / np.maximum(np.count_nonzero(known, axis=1), 1)
+
+
+@dataclass(frozen=True, slots=True)
+class _Windows:
+    """Disparities of 5 x 5 pixels around N places.
+
+    center_px: (N, 2) int64, where they are. median_px: (N,) of the inner 3 x 3, off_median_px:
+    (N, 25) what each is more. on_plane: (N, 25) which are known and not across a depth edge.
+    """
+
+    center_px: NDArray[np.int64]
+    median_px: Array
+    off_median_px: Array
+    on_plane: NDArray[np.bool_]
+
+
+def _read_windows(
+    disparity_px: NDArray[np.float32], uv_px: Array, sigma_px: float, spread: int
+) -> _Windows:
+    """spread: px, from one to the next of the 5 x 5 pixels."""
     H, W = disparity_px.shape
     reach = _HALF * spread
     x0 = np.clip(np.rint(uv_px[:, 0]).astype(np.int64), reach, W - 1 - reach)
@@ -85,13 +112,22 @@ def _fit_planes(
     edge = spread * _EDGE_SHARE * median + _EDGE_SIGMAS * sigma_px
     window -= median[:, None]
     on_plane = np.abs(window) < edge[:, None]
+    return _Windows(np.stack([x0, y0], -1), median, window, on_plane)
+
+
+def _fit_planes(
+    disparity_px: NDArray[np.float32], uv_px: Array, sigma_px: float, spread: int
+) -> Array:
+    """(N, 3) disparity and its slopes at places (N, 2), NaN where too few pixels lie on a plane."""
+    window = _read_windows(disparity_px, uv_px, sigma_px, spread)
+    on_plane = window.on_plane
     plane = _planes_at(
-        np.where(on_plane, window, 0.0),
+        np.where(on_plane, window.off_median_px, 0.0),
         on_plane.astype(np.float64),
-        (uv_px[:, 0] - x0) / spread,
-        (uv_px[:, 1] - y0) / spread,
+        (uv_px[:, 0] - window.center_px[:, 0]) / spread,
+        (uv_px[:, 1] - window.center_px[:, 1]) / spread,
     )
-    plane[:, 0] += median
+    plane[:, 0] += window.median_px
     plane[:, 1:] /= spread
     plane[on_plane.sum(1) < _MIN_SUPPORT * len(_DX)] = np.nan
     return plane

@@ -61,14 +61,7 @@ class Expectation:
         front = (moved[:, 2] > MIN_DEPTH_M) & np.repeat(known, sizes)
         expected = np.full((len(points), 2), np.nan)
         expected[front] = project_stereo(self.sensor.camera, moved[front])[:, :2]
-        return follow_points(
-            self.last.view.gray,
-            self.view.gray,
-            self.view.flow_prev_to_curr_px,
-            points.uv_px,
-            expected,
-            self.sensor.noise,
-        )
+        return follow_points(self.last.view, self.view, points.uv_px, expected, self.sensor.noise)
 
 
 def _is_predictable(track: ObjectTrack) -> bool:

@@ -113,6 +113,16 @@ def test_missed_false_and_ghosts_are_counted(world):
     assert found["tracking"]["fragmentations"] == 1
 
 
+@pytest.mark.parametrize(("deg_a_frame", "n_false"), [(0.0, 3), (1.5, 3), (3.0, 0)])
+def test_what_turns_on_the_spot_does_not_stand_still(world, deg_a_frame, n_false):
+    """At 30 deg/s its matter moves, though its origin does not; 15 may be the labels' noise."""
+    spin = exp_se3(np.array([0.0, np.radians(deg_a_frame), 0.0, 0.0, 0.0, 0.0]))
+    for k in (5, 6, 7):
+        world.poses[2][k] = world.poses[2][k - 1] @ spin
+    found = evaluate_objects(world.estimates(), world.truth(), world.frames())
+    assert found["false_movers"] == n_false
+
+
 def test_what_is_too_small_or_too_far_is_not_wanted(world):
     truth = world.truth()
     truth.n_pixels[truth.object_id == 2] = 149

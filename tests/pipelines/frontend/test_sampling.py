@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from pipelines.frontend.sampling import disparity_slopes, sample_bilinear, sample_disparity
+from pipelines.frontend.sampling import (
+    disparity_slopes,
+    edge_share,
+    sample_bilinear,
+    sample_disparity,
+)
 
 H, W = 60, 80
 V, U = np.mgrid[:H, :W].astype(np.float64)
@@ -155,3 +160,22 @@ def test_maps_are_not_changed():
     sample_bilinear(disparity, uv)
     np.testing.assert_array_equal(disparity, before[0])
     np.testing.assert_array_equal(uv, before[1])
+
+
+def test_share_across_a_depth_edge():
+    """Beside an edge it is what lies across; slants, noise and unknown pixels are no edges."""
+    rng, sigma = np.random.default_rng(1), 0.1
+    disparity = np.where(U < 40, 20.0, 8.0) + rng.normal(0.0, sigma, (H, W))
+    columns = np.array([20.0, 30.0, 33.0, 37.0, 41.0, 47.0, 60.0])
+    uv = np.column_stack([columns, np.full(len(columns), 30.0)])
+    np.testing.assert_allclose(
+        edge_share(disparity.astype(np.float32), uv, sigma),
+        np.array([0, 0, 1, 2, 2, 1, 0]) / 5.0,
+    )
+    slanted = (plane(20.0, 0.05, -0.08) + rng.normal(0.0, sigma, (H, W))).astype(np.float32)
+    assert (edge_share(slanted, random_places(200, 0.0), sigma) == 0.0).all()
+    slanted[:, ::3] = np.nan
+    assert (edge_share(slanted, random_places(200, 0.0), sigma) == 0.0).all()
+    nothing = np.full((H, W), np.nan, np.float32)
+    assert (edge_share(nothing, uv, sigma) == 0.0).all()
+    assert edge_share(nothing, np.empty((0, 2)), sigma).shape == (0,)

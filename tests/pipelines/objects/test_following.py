@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from pipelines.frontend.noise import NoiseModel
+from pipelines.frontend.view import View
 from pipelines.objects.following import Followed, follow_points
+from pipelines.types import Features
 
 SHIFT = np.array([4.0, -2.0])
 H, W = 120, 200
@@ -22,8 +24,16 @@ def flow(shift=SHIFT):
     return np.broadcast_to(np.float32(shift), (H, W, 2)).copy()
 
 
-def follow(flow_px, expected_px, uv=UV):
-    return follow_points(PREV, NOW, flow_px, uv, expected_px, NoiseModel())
+def view_of(gray, flow_px=None, disparity_px=None):
+    if disparity_px is None:
+        disparity_px = np.full((H, W), 20.0, np.float32)
+    everywhere = np.ones((H, W), bool)
+    return View(0, 0.0, gray, gray, disparity_px, everywhere, Features.empty(), flow_px)
+
+
+def follow(flow_px, expected_px, uv=UV, disparity_px=None, noise=None):
+    now = view_of(NOW, flow_px, disparity_px)
+    return follow_points(view_of(PREV), now, uv, expected_px, noise or NoiseModel())
 
 
 @pytest.mark.parametrize("with_flow", [True, False])
@@ -60,9 +70,7 @@ def test_where_both_contradict_the_one_nearer_to_the_expected_is_believed():
 
 
 def test_points_that_leave_the_image_are_lost():
-    out = follow_points(
-        PREV, NOW, flow((300.0, 0.0)), UV, NOWHERE, NoiseModel(sigma_disparity_px=1.0)
-    )
+    out = follow(flow((300.0, 0.0)), NOWHERE)
     assert not (out.valid & (out.uv_px[:, 0] > W - 1)).any()
     edge = np.array([[W - 3.0, 60.0], [60.0, 1.0]])  # shifted by 4 and -2
     assert not follow(flow(), np.full((2, 2), np.nan), edge).valid.any()
@@ -82,3 +90,19 @@ def test_no_points():
     both = Followed.concatenate(follow(flow(), NOWHERE), Followed.empty())
     assert len(both.valid) == len(UV)
     assert len(both[both.valid].sigma_px) == both.valid.sum()
+
+
+@pytest.mark.parametrize("sigma_flow_px", [0.3, 0.005])
+def test_beside_a_depth_edge_a_place_is_less_precise(sigma_flow_px):
+    """What lies across moves otherwise; but exact flow knows of no windows."""
+    disparity = np.where(np.arange(W) < 100, 20.0, 8.0) * np.ones((H, 1))
+    noise = NoiseModel()
+    noise.sigma_uv_px |= {"object_flow": sigma_flow_px, "object_alignment": 0.1}
+    found = follow(flow(), UV + SHIFT, disparity_px=disparity.astype(np.float32), noise=noise)
+    near = np.abs(found.uv_px[:, 0] - 100.0) < 9.0
+    beside, away = found.sigma_px[found.valid & near], found.sigma_px[found.valid & ~near]
+    assert len(beside) > 5 and np.ptp(away) < 1e-9
+    if sigma_flow_px > 0.1:
+        assert beside.min() > 3.0 * away.max()
+    else:
+        assert beside.max() == pytest.approx(away.max())
