@@ -17,6 +17,7 @@ from pipelines.types import Array, Image
 _WINDOW_PX = 17  # side of the aligned patch
 _PYRAMID_LEVELS = 1  # one coarser level: the predictions are good to some pixels
 _AGREE_SIGMAS = 3.0  # two measurements further apart are not of the same place
+_PRECISE_SHARE = 0.2  # of alignment's noise, below which flow gains 2 % by it at most
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.005)
 
 
@@ -56,6 +57,14 @@ def align_patches(
         uv[which], found[which] = placed[:, 0], status[:, 0] > 0
     shift = np.linalg.norm(uv - start, axis=1)
     return uv, found & (shift <= max_shift_px)
+
+
+def is_precise(flow_sigma_px: float, alignment_sigma_px: float) -> bool:
+    """Whether flow is so much more precise than alignment that it needs none.
+
+    Such flow is no average over windows either: it ends where a depth edge is.
+    """
+    return flow_sigma_px < _PRECISE_SHARE * alignment_sigma_px
 
 
 def fuse_measurements(

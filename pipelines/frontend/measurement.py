@@ -5,14 +5,14 @@ Owns the search for points by flow, by ORB descriptors and by patch alignment. E
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipelines.config import TrackingConfig
-from pipelines.frontend.alignment import align_patches, fuse_measurements
+from pipelines.frontend.alignment import align_patches, fuse_measurements, is_precise
 from pipelines.frontend.matching import match_in_radius
 from pipelines.frontend.patches import Patches
 from pipelines.frontend.sampling import sample_bilinear
@@ -72,9 +72,18 @@ def measure_points(
     start = _places_to_start(last, view, sparse_map, T_world_camera, flow_uv, config)
     by_flow = np.asarray(np.isfinite(flow_uv).all(axis=1))
     tolerance = config.flow_tolerance_px if by_flow.any() else _ALIGNMENT_TOLERANCE_PX
-    tracks = last.tracks
-    aligned, ok = _align(last, view, start, by_flow, T_world_camera, sensor.camera, tolerance)
-    sigma = sensor.noise.sigma_uv_px
+    tracks, sigma = last.tracks, sensor.noise.sigma_uv_px
+    aligned, ok = np.full_like(flow_uv, np.nan), np.zeros(len(tracks), bool)
+    do = np.flatnonzero(~(by_flow & is_precise(sigma["flow"], sigma["alignment"])))
+    aligned[do], ok[do] = _align(
+        replace(last, tracks=tracks[do]),
+        view,
+        start[do],
+        by_flow[do],
+        T_world_camera,
+        sensor.camera,
+        tolerance,
+    )
     uv, valid, sigma_px = fuse_measurements(
         flow_uv, by_flow, sigma["flow"], aligned, ok, sigma["alignment"]
     )

@@ -127,13 +127,15 @@ class Patches:
         seen_at = np.einsum("nij,nj->ni", Hs, np.column_stack([uv, np.ones(n)]))
         seen_at = seen_at[:, :2] / seen_at[:, 2:]
         back = np.linalg.inv(_shift(within - seen_at) @ Hs @ _shift(uv - within))
-        source = (back.reshape(-1, 3).astype(np.float32) @ _PIXELS).reshape(n, 3, -1)
-        source[:, :2] /= source[:, 2:]
-        np.clip(source[:, :2], 0, SIDE_PX - 1, out=source[:, :2])
-        source[:, 1] += SIDE_PX * np.arange(n, dtype=np.float32)[:, None]
-        at = np.ascontiguousarray(source[:, :2].swapaxes(0, 1)).reshape(2, -1, SIDE_PX)
+        # By coordinate, as the remapping takes them: copies would cost as much as all the rest
+        x, y, w = np.ascontiguousarray(back.swapaxes(0, 1), dtype=np.float32) @ _PIXELS
+        for at in (x, y):
+            np.divide(at, w, out=at)
+            np.clip(at, 0, SIDE_PX - 1, out=at)
+        y += SIDE_PX * np.arange(n, dtype=np.float32)[:, None]
         column = self.pixels[rows].reshape(-1, SIDE_PX)
-        warped = cv2.remap(column, at[0], at[1], cv2.INTER_LINEAR)
+        x, y = x.reshape(-1, SIDE_PX), y.reshape(-1, SIDE_PX)
+        warped = cv2.remap(column, x, y, cv2.INTER_LINEAR)
         return warped.reshape(n, SIDE_PX, SIDE_PX)
 
 

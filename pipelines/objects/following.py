@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.frontend.alignment import align_patches, fuse_measurements
+from pipelines.frontend.alignment import align_patches, fuse_measurements, is_precise
 from pipelines.frontend.noise import NoiseModel
 from pipelines.frontend.sampling import edge_share, sample_bilinear
 from pipelines.frontend.view import View
@@ -22,7 +22,6 @@ _NEAR_PX = 3.0  # how far the expected place itself may be off
 # Where all that surrounds a point is across a depth edge, it is so many times less precise again.
 # Measured by the errors of simulated drives and rooms.
 _EDGE_SIGMAS = 15.0
-_BY_WINDOWS = 0.2  # of the noise of alignment, below which flow is no average over windows
 _SURPRISE_PX = 12.0  # flow that leads farther from the expected place is not of the object
 
 
@@ -80,12 +79,13 @@ def follow_points(
     off_flow = np.linalg.norm(by_flow - expected_px, axis=1)
     with np.errstate(invalid="ignore"):
         sure = has_flow & ~(off_flow > _SURE_PX)
-    aligned, has_alignment = align_patches(
-        view_prev.gray, view.gray, uv_prev_px, start, _TOLERANCE_PX, sure
-    )
     sigma_flow, sigma_aligned = (
         noise.sigma_uv_px["object_flow"],
         noise.sigma_uv_px["object_alignment"],
+    )
+    start[has_flow & is_precise(sigma_flow, sigma_aligned)] = np.nan
+    aligned, has_alignment = align_patches(
+        view_prev.gray, view.gray, uv_prev_px, start, _TOLERANCE_PX, sure
     )
     off_aligned = np.linalg.norm(aligned - expected_px, axis=1)
     apart = np.linalg.norm(by_flow - aligned, axis=1) > 3.0 * np.hypot(sigma_flow, sigma_aligned)
@@ -106,13 +106,10 @@ def follow_points(
 
 
 def _beside_edge(view: View, uv_px: Array, valid: NDArray[np.bool_], noise: NoiseModel) -> Array:
-    """(N,) how many times less precise points are for the depth edges about them.
-
-    Flow that is far more precise than alignment does not come from windows, and sees no edges.
-    """
+    """(N,) how many times less precise points are for the depth edges about them."""
     factor = np.ones(len(uv_px))
     flow_px, aligned_px = noise.sigma_uv_px["object_flow"], noise.sigma_uv_px["object_alignment"]
-    if view.flow_prev_to_curr_px is None or flow_px > _BY_WINDOWS * aligned_px:
+    if view.flow_prev_to_curr_px is None or not is_precise(flow_px, aligned_px):
         across = edge_share(view.disparity_px, uv_px[valid], noise.sigma_disparity_px)
         factor[valid] += _EDGE_SIGMAS * across
     return factor
