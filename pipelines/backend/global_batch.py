@@ -17,7 +17,7 @@ from pipelines.backend.batch_solver import solve
 from pipelines.backend.guard import CAMERA, Verdict, judge, keep_motions, misfit_motions
 from pipelines.backend.held_out import hold_out
 from pipelines.backend.marginals import PoseCovariances
-from pipelines.backend.misfit import allow_for_noisy_views
+from pipelines.backend.misfit import allow_for_noisy_views, learn_carried
 from pipelines.backend.object_graph import pose_graph
 from pipelines.backend.point_elimination import Residuals
 from pipelines.backend.score_bootstrap import bootstrap_covariances
@@ -87,7 +87,7 @@ def run_global_batch(
     )
     if len(start.tracks) == 0:
         return None
-    start = allow_for_noisy_views(start)
+    start = allow_for_noisy_views(learn_carried(start))
     tracks, rows, held = hold_out(start.tracks, start.sighting_rows, config.held_out_share)
     problem = start.with_tracks(tracks, rows)
     graph = pose_graph(problem, config)

@@ -5,7 +5,7 @@ Owns their choice and their errors: the honest measure of whether a batch made t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -23,7 +23,8 @@ class HeldOut:
     """H sightings that are left out.
 
     view, track: (H,) as in the tracks that are kept. uv_px, disparity_px: what was seen.
-    sigma_to_px, sigma_from_px: (H,) of the steps to it and from it. sigma_disparity_px: (H,).
+    sigma_to_px, sigma_from_px: (H,) of the steps to it and from it, carried_to, carried_from: (H,)
+    as of these steps. sigma_disparity_px: (H,).
     row_before, row_after: (H,) rows of the kept tracks between which it lay.
     """
 
@@ -33,6 +34,8 @@ class HeldOut:
     disparity_px: Array
     sigma_to_px: Array
     sigma_from_px: Array
+    carried_to: Array
+    carried_from: Array
     sigma_disparity_px: Array
     row_before: Index
     row_after: Index
@@ -64,13 +67,16 @@ def hold_out(
         tracks.disparity_px[out],
         tracks.sigma_uv_px[out],
         tracks.sigma_uv_px[out + 1],
+        tracks.carried[out],
+        tracks.carried[out + 1],
         tracks.sigma_disparity_px[out],
         place[out - 1],
         place[out + 1],
     )
-    sigma = tracks.sigma_uv_px.copy()
-    sigma[out + 1] = np.hypot(sigma[out], sigma[out + 1])
-    wider = tracks.with_sigmas(sigma, tracks.sigma_disparity_px)
+    sigma, carried = tracks.sigma_uv_px.copy(), tracks.carried.copy()
+    sigma[out + 1] = np.hypot(carried[out + 1] * sigma[out], sigma[out + 1])
+    carried[out + 1] *= carried[out]
+    wider = replace(tracks, sigma_uv_px=sigma, carried=carried)
     arrays = {f.name: getattr(wider, f.name)[~chosen] for f in fields(tracks)[:7]}
     kept = PointTracks(**arrays, n_tracks=tracks.n_tracks, n_views=tracks.n_views)
     return kept, rows_of_log[~chosen], held
@@ -86,18 +92,20 @@ def held_out_errors(
     """
     R, t = Ts_body_camera[held.view, :3, :3], Ts_body_camera[held.view, :3, 3]
     p = np.einsum("nji,nj->ni", R, points_m[held.track] - t)
-    to2, from2 = held.sigma_to_px**2, held.sigma_from_px**2
-    share = (from2 / (to2 + from2))[:, None]
-    miss = _misses(camera, kept.uv_px, camera_points(kept, Ts_body_camera, points_m))
-    expected = share * miss[held.row_before] + (1.0 - share) * miss[held.row_after]
-    uv = (_misses(camera, held.uv_px, p) - expected) / np.sqrt(to2 * share[:, 0])[:, None]
+    weight_to, weight_from = held.sigma_to_px**-2.0, held.sigma_from_px**-2.0
+    variance = 1.0 / (weight_to + held.carried_from**2 * weight_from)
+    share_before = (variance * weight_to * held.carried_to)[:, None]
+    share_after = (variance * weight_from * held.carried_from)[:, None]
+    miss = misses_px(camera, kept.uv_px, camera_points(kept, Ts_body_camera, points_m))
+    expected = share_before * miss[held.row_before] + share_after * miss[held.row_after]
+    uv = (misses_px(camera, held.uv_px, p) - expected) / np.sqrt(variance)[:, None]
     z = np.maximum(p[:, 2], MIN_DEPTH_M)
     disparity = (held.disparity_px - camera.bf / z) / held.sigma_disparity_px
     squares = np.minimum(np.column_stack([uv, disparity]) ** 2, _MOST)
     return np.nanmean(squares, axis=1)
 
 
-def _misses(camera: StereoCamera, uv_px: Array, points: Array) -> Array:
+def misses_px(camera: StereoCamera, uv_px: Array, points: Array) -> Array:
     """(N, 2) pixels seen less projected; points near the camera's plane are far off."""
     z = np.maximum(points[:, 2:], MIN_DEPTH_M)
     return uv_px - (points[:, :2] / z * (camera.fx, camera.fy) + (camera.cx, camera.cy))

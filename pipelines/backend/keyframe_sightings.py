@@ -99,7 +99,7 @@ def to_tracks(seen: KeyframeSightings, most_per_keyframe: int = 0) -> tuple[Poin
     tracks = PointTracks(
         view,
         track,
-        followed,
+        followed.astype(np.float64),
         seen.uv_px[order],
         seen.disparity_px[order],
         sigma_uv_px,

@@ -5,16 +5,22 @@ Owns the squared errors that verdicts and weights are made of. Solves nothing.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.backend.batch_problem import BatchProblem
-from pipelines.backend.point_elimination import evaluate, settle_points
+from pipelines.backend.held_out import misses_px
+from pipelines.backend.point_elimination import camera_points, evaluate, settle_points
 from pipelines.types import Array
 
 _BEHIND = 100.0  # squared standard deviations that a point behind the camera counts as
 _NOISY = 2.0  # times the median misfit of all objects, from which on a view of one is noisy
 _MAX_NOISE_FACTOR = 4.0  # of its standard deviations then
+_FAR = 8  # frames, over which the growth of errors is measured
+_MIN_SAMPLES = 200  # fewer pairs of sightings so far apart say nothing of it
+_LEAST_CARRIED = 0.05  # nothing at all would count as not followed
 
 
 def squared_misfits(problem: BatchProblem) -> Array:
@@ -60,3 +66,33 @@ def _medians(values: Array, group: NDArray[np.int64], n: int) -> Array:
     medians = np.zeros(n)
     medians[found] = values[order][(starts + sizes // 2)[found]]
     return medians
+
+
+def learn_carried(problem: BatchProblem) -> BatchProblem:
+    """The same problem with the share of a static sighting's error that goes on in the next one.
+
+    Where points are aligned to their first sight, errors are partly new in every frame; where flow
+    or worn patches lead from frame to frame they walk. How much farther errors come apart over some
+    frames than over one tells, at the front-end's poses: both are a first-order Markov process.
+    """
+    tracks = problem.tracks
+    far = np.arange(_FAR, len(tracks))
+    run = np.cumsum(~tracks.is_followed)
+    far = far[(run[far] == run[far - _FAR]) & (tracks.view[far] < problem.n_frames)]
+    if len(far) < _MIN_SAMPLES:
+        return problem
+    views = problem.views(problem.Ts_world_camera, problem.Ts_world_object)
+    alone = replace(tracks, carried=np.zeros(len(tracks)))
+    points = settle_points(problem.camera, alone, views, problem.points_m)
+    off = misses_px(problem.camera, tracks.uv_px, camera_points(tracks, views, points))
+    growth = np.median(np.abs(off[far] - off[far - _FAR])) / np.median(
+        np.abs(off[far] - off[far - 1])
+    )
+    shares = np.linspace(_LEAST_CARRIED, 1.0, 200, endpoint=False)
+    expected = np.sqrt((1.0 - shares**_FAR) / (1.0 - shares))
+    carried = float(np.interp(growth, expected, shares, right=1.0))
+    static = tracks.is_followed & (tracks.view < problem.n_frames)
+    # What is told of a step is of the difference of two errors
+    sigma = tracks.sigma_uv_px * np.where(static, np.sqrt(0.5 * (1.0 + carried)), 1.0)
+    learned = replace(tracks, carried=np.where(static, carried, tracks.carried), sigma_uv_px=sigma)
+    return problem.with_tracks(learned, problem.sighting_rows)

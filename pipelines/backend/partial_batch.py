@@ -17,6 +17,7 @@ from pipelines.backend.batch_solver import solve
 from pipelines.backend.global_batch import BatchResult, as_result, has_enough, inliers
 from pipelines.backend.guard import judge
 from pipelines.backend.held_out import hold_out
+from pipelines.backend.misfit import learn_carried
 from pipelines.backend.object_graph import pose_graph
 from pipelines.backend.point_elimination import settle_points
 from pipelines.backend.point_tracks import Index, PointTracks
@@ -43,6 +44,7 @@ def run_partial_batch(
     start = build_problem(camera, log, ObjectEstimates.empty(), config.max_static_per_frame)
     if len(start.tracks) == 0:
         return None
+    start = learn_carried(start)
     tracks, rows, held = hold_out(start.tracks, start.sighting_rows, config.held_out_share)
     before = start.with_tracks(tracks, rows)
     problem, n_outliers, costs = before, 0, np.zeros(2)
@@ -111,7 +113,7 @@ def window_of(problem: BatchProblem, first: int, end: int) -> tuple[BatchProblem
     arrays["view"] = arrays["view"] - first
     arrays["track"] = track.ravel()
     begins = np.r_[True, np.diff(arrays["track"]) != 0][: len(track)]
-    arrays["is_followed"] = arrays["is_followed"] & ~begins
+    arrays["carried"] = np.where(begins, 0.0, arrays["carried"])
     own = slice(first, end)
     part = BatchProblem(
         problem.camera,

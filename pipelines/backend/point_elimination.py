@@ -100,7 +100,7 @@ def evaluate(
     z = np.where(front, p[:, 2], 1.0)
     K = np.array([camera.fx, camera.fy])
     miss = tracks.uv_px - (p[:, :2] / z[:, None] * K + (camera.cx, camera.cy))
-    before = np.where(tracks.is_followed[:, None], np.roll(miss, 1, axis=0), 0.0)
+    before = tracks.carried[:, None] * np.roll(miss, 1, axis=0)
     uv = (miss - before) / tracks.sigma_uv_px[:, None]
     disparity = (tracks.disparity_px - camera.bf / z) / tracks.sigma_disparity_px
     known = np.isfinite(disparity) & front & keep_disparity
@@ -151,7 +151,7 @@ def _whiten(
     Jm = D @ Ts_body_camera[tracks.view][:, :3, :3].transpose(0, 2, 1)
     root_uv, root_d = np.sqrt(residuals.weight_uv), np.sqrt(residuals.weight_disparity)
     w = root_uv / tracks.sigma_uv_px
-    w_before = np.where(tracks.is_followed, w, 0.0)
+    w_before = tracks.carried * w
     w_d = root_d / tracks.sigma_disparity_px
     A = np.empty((len(tracks), 3, 3))
     A[:, :2] = w[:, None, None] * Jm[:, :2]

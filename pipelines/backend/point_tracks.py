@@ -22,15 +22,15 @@ Index = NDArray[np.int64]
 class PointTracks:
     """N sightings of P tracks in V views, sorted by track and then by view.
 
-    view, track: (N,) int64. is_followed: (N,) bool, whether the sighting was followed from the one
-    before it in these arrays. uv_px: (N, 2). disparity_px: (N,) NaN where unknown.
-    sigma_uv_px: (N,) of the step from the sighting before where followed, else of the place.
-    sigma_disparity_px: (N,). n_tracks, n_views: P and V.
+    view, track: (N,) int64. carried: (N,) share of the error of the sighting before, in these
+    arrays, that goes on in this one: 1 where errors walk, 0 where it was not followed from there.
+    uv_px: (N, 2). disparity_px: (N,) NaN where unknown. sigma_uv_px: (N,) of what is new in the
+    error where followed, else of the place. sigma_disparity_px: (N,). n_tracks, n_views: P and V.
     """
 
     view: Index
     track: Index
-    is_followed: NDArray[np.bool_]
+    carried: Array
     uv_px: Array
     disparity_px: Array
     sigma_uv_px: Array
@@ -40,6 +40,11 @@ class PointTracks:
 
     def __len__(self) -> int:
         return len(self.view)
+
+    @property
+    def is_followed(self) -> NDArray[np.bool_]:
+        """(N,) whether a sighting was followed from the one before it in these arrays."""
+        return self.carried > 0.0
 
     @property
     def starts(self) -> Index:
@@ -89,9 +94,7 @@ def build_tracks(
     rows = np.flatnonzero(body >= 0)
     if len(rows) == 0:
         nothing, none = np.empty(0, np.int64), np.empty(0)
-        tracks = PointTracks(
-            nothing, nothing, np.empty(0, bool), np.empty((0, 2)), none, none, none, 0, n_views
-        )
+        tracks = PointTracks(nothing, nothing, none, np.empty((0, 2)), none, none, none, 0, n_views)
         return tracks, nothing
     order = np.lexsort((view[rows], sightings.track_id[rows], body[rows]))
     rows = rows[order]
@@ -107,7 +110,7 @@ def build_tracks(
     tracks = PointTracks(
         view[rows],
         track,
-        same & np.r_[False, np.diff(k) == 1] if len(rows) else np.zeros(0, bool),
+        (same & np.r_[False, np.diff(k) == 1][: len(k)]).astype(np.float64),
         chosen.uv_px,
         chosen.disparity_px,
         chosen.sigma_uv_px,

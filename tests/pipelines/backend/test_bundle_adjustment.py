@@ -37,7 +37,7 @@ def make_problem(seed=0, n_keyframes=6, n_points=200, n_held=2):
     tracks = PointTracks(
         keyframe,
         point,
-        followed,
+        followed.astype(np.float64),
         uv.reshape(-1, 2),
         disparity.ravel(),
         np.where(followed, SIGMA_UV_PX, FIRST_UV_PX),
