@@ -178,7 +178,7 @@ def test_from_above_what_is_ahead_is_to_the_right(scene):
 @pytest.mark.parametrize("size", [SIZE, {"width": 390, "height": 760}])
 def test_views_of_the_whole_lie_between_the_panels(scene, size):
     scene.page.set_viewport_size(size)
-    scene.until(f"window.innerWidth === {size['width']}")
+    scene.until(f"dyob.player.labels.width === {size['width']}")  # laid out anew
     head, picture, controls = (
         scene.page.locator(name).bounding_box() for name in ("#head", "#picture", "#controls")
     )
