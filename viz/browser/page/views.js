@@ -66,11 +66,12 @@ class Views {
   spread() {
     const { THREE } = MeshCat, { world, frames } = this;
     const passed = [frames.list, ...[...frames.moved].map((id) => frames.paths.get(id))].flat();
-    const points = thinned(passed).map(({ p }) => world.toThree(p));
+    const step = Math.ceil(passed.length / MOST_POINTS);
+    const points = passed.filter((_, n) => n % step === 0).map(({ p }) => world.toThree(p));
     const margin = 0.3 * world.facts.scale_m, box = new THREE.Box3().setFromPoints(points);
     if (box.isEmpty()) box.expandByPoint(new THREE.Vector3());
     points.push(box.min.subScalar(margin), box.max.addScalar(margin));
-    return points.concat(thinned(world.mapPoints()));
+    return points.concat(world.mapPoints(MOST_POINTS));
   }
 
   top() {
@@ -166,10 +167,4 @@ class Views {
     camera.far = 20 * min.distanceTo(max) + 100 * s;
     camera.updateProjectionMatrix();
   }
-}
-
-// Some of many, evenly.
-function thinned(values) {
-  const step = Math.ceil(values.length / MOST_POINTS);
-  return values.filter((_, n) => n % step === 0);
 }

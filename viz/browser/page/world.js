@@ -103,12 +103,13 @@ class World {
     this.show();
   }
 
-  // The map without its outskirts, in three's coordinates.
-  mapPoints() {
+  // Points of the map without its outskirts, at most so many, in three's coordinates.
+  mapPoints(most) {
     const [low, high] = this.facts.extent_m, found = [];
     if (!this.cloud || !low) return found;
     const { array } = this.cloud.geometry.attributes.position, { Vector3 } = MeshCat.THREE;
-    for (let n = 0; n < array.length; n += 3) {
+    const step = 3 * Math.ceil(array.length / (3 * most));
+    for (let n = 0; n < array.length; n += step) {
       const point = this.toThree(new Vector3(array[n], array[n + 1], array[n + 2]));
       const placed = [point.x, -point.z, point.y];
       if (placed.every((value, axis) => low[axis] <= value && value <= high[axis])) found.push(point);
