@@ -17,7 +17,7 @@ from viz.smoothing import smoothed
 LOWEST = 0.04  # quantile of the points' heights about the camera: that is where the ground is
 MOST_MEASURED = 200  # frames; what lies between is interpolated
 ABOUT = 1.5  # reaches round the camera in which points tell of the ground
-STEP, SPAN = 0.25, 3.0  # reaches: most that the lines are apart, and how far they go
+STEP, SPAN = 0.35, 3.0  # reaches: most that the lines are apart, and how far they go
 STEPS_M = tuple(base * 10.0**power for power in range(-3, 4) for base in (1, 2, 5))
 GREY_ON_WHITE, GREY_ON_BLACK = (214, 219, 226), (52, 57, 66)
 

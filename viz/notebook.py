@@ -14,6 +14,11 @@ from pipelines.io.result import Result
 from pipelines.types import Image
 from viz import markup
 
+# JupyterLab sets all cells to the right, words as well.
+_TABLE_STYLE = (
+    "<style>.wide th, .wide td {text-align: left !important} "
+    ".wide .number {text-align: right !important}</style>"
+)
 _PICTURE_STYLE = "<style>figure {margin: 0} figure img {width: 100%; max-width: 1242px}</style>"
 
 
@@ -31,7 +36,7 @@ def show_table(heading: Sequence[str], rows: Iterable[Sequence[Any]]) -> Any:
     """A plain table: column names, then rows of as many cells each, numbers as you format them."""
     from IPython.display import HTML
 
-    return HTML(markup.table(heading, rows))
+    return HTML(_TABLE_STYLE + markup.table(heading, rows))
 
 
 def show_scene(result: Result, height: int = 560) -> Any:

@@ -23,6 +23,7 @@ from pipelines.io.timings import TOTAL, WALL, stage_summaries
 from pipelines.types import Array
 from viz import object_plots, style
 from viz.figures import digits, metric_unit, new_figure, save_figure, whole_ticks
+from viz.scene import level_axes
 from viz.style import hex_color as _hex
 
 STILL_M = 0.05  # to either side is shown at the least
@@ -84,31 +85,31 @@ def figure_of(result: Result | Path | str, name: str) -> Any:
 
 def plot_trajectory(figure: Any, result: Result) -> None:
     """The ground plane from above, the longer side across; where the truth is known, the error."""
-    path = result.Ts_world_camera[:, :3, 3]
-    truth = None if result.gt_Ts_world_camera is None else result.gt_Ts_world_camera[:, :3, 3]
+    up, ahead = level_axes(result.Ts_world_camera)
+    on_ground = np.stack([np.cross(ahead, up), ahead])  # the first camera may have looked down
+    path = result.Ts_world_camera[:, :3, 3] @ on_ground.T
     stamps_s, errors_m = _position_errors(result)
     if len(errors_m) > 1:
         axes, below = figure.subplots(2, 1, height_ratios=(3, 1.4))
         _plot_position_errors(below, stamps_s - result.timestamps_s[0], errors_m)
     else:
         axes = figure.subplots()
-    spans = np.ptp(path, axis=0)
-    # A drive ahead would be a thin upright line in a wide, empty picture.
-    across, upward = (2, 0) if spans[2] > spans[0] else (0, 2)
-    if truth is not None:
-        axes.plot(
-            *truth[:, [across, upward]].T, color=_hex(style.TRUTH), lw=5, label="ground truth"
-        )
-    axes.plot(*path[:, [across, upward]].T, color=_hex(style.ESTIMATE), lw=1.8, label="estimate")
-    axes.plot(*path[0, [across, upward]], "o", color=_hex(style.START), ms=8, label="start")
-    axes.plot(*path[-1, [across, upward]], "o", color=_hex(style.END), ms=8, label="end")
-    words = {0: "x, to the right (m)", 2: "z, ahead (m)"}
-    axes.set(xlabel=words[across], ylabel=words[upward], title="Camera path from above")
+    words = ["to the right (m)", "ahead (m)"]
+    turned = np.ptp(path[:, 1]) > np.ptp(path[:, 0])
+    if turned:  # a drive ahead would be a thin upright line in a wide, empty picture
+        on_ground, path, words = on_ground[::-1], path[:, ::-1], words[::-1]
+    if result.gt_Ts_world_camera is not None:
+        truth = result.gt_Ts_world_camera[:, :3, 3] @ on_ground.T
+        axes.plot(*truth.T, color=_hex(style.TRUTH), lw=5, label="ground truth")
+    axes.plot(*path.T, color=_hex(style.ESTIMATE), lw=1.8, label="estimate")
+    axes.plot(*path[0], "o", color=_hex(style.START), ms=8, label="start")
+    axes.plot(*path[-1], "o", color=_hex(style.END), ms=8, label="end")
+    axes.set(xlabel=words[0], ylabel=words[1], title="Camera path from above")
     axes.set_aspect("equal", adjustable="datalim")
     # The noise of a camera that stands still is no path to fill the picture with.
-    centre = path[:, [across, upward]].mean(axis=0)
+    centre = path.mean(axis=0)
     axes.update_datalim([centre - STILL_M, centre + STILL_M])
-    if across == 2:
+    if turned:
         axes.invert_yaxis()  # looking ahead is to the right here, so the right is downward
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 

@@ -88,7 +88,7 @@ def build_scene(result: Result, *, keyframe_every: int | None = None) -> Scene:
     """
     Ts = result.Ts_world_camera
     path = Ts[:, :3, 3] if len(Ts) else np.zeros((1, 3))
-    up = _up(Ts)
+    up, forward = level_axes(Ts)
     keep = near_path(result.static_points_m, path)
     points, colors = result.static_points_m[keep], result.static_colors[keep]
     polylines, tags = object_paths(result.objects)  # below the camera's path, which they may hide
@@ -107,7 +107,6 @@ def build_scene(result: Result, *, keyframe_every: int | None = None) -> Scene:
         polylines += [Polyline(f, style.FRUSTUM, 1.0) for f in frustums(Ts[::step], size_m)]
     for piece in split_at_gaps(result.timestamps_s, path[: len(Ts)]):
         polylines.append(Polyline(piece, style.ESTIMATE, 2.4, "camera, estimated"))
-    forward = _forward(Ts, up)
     return Scene(
         points, colors, path, tuple(polylines), up, forward, tuple(tags), tuple(true_paths)
     )
@@ -146,6 +145,12 @@ def extent_m(path_m: Array, points_m: Array) -> float:
         lows.append(low)
         highs.append(high)
     return max(float(np.linalg.norm(np.max(highs, 0) - np.min(lows, 0))), 0.1)
+
+
+def level_axes(Ts_world_camera: Array) -> tuple[Array, Array]:
+    """The scene's up and forward, (3,) unit vectors, as its cameras (F, 4, 4) tell them."""
+    up = _up(Ts_world_camera)
+    return up, _forward(Ts_world_camera, up)
 
 
 def _up(Ts: Array) -> Array:

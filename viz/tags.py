@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.types import Image
+from pipelines.types import Array, Image
 from viz import style
 from viz.legend import text_size_px
 from viz.object_marks import Box, overlaps
@@ -44,11 +44,12 @@ def draw_ends(
         taken.append((u - r, v - r, u + r, v + r))
         seen.append((word, u, v, shown))
     paths = _path_parts(scene, view)
+    discs = [_around(tag.point_m, view, r) for tag in scene.tags]  # which are drawn later
     for word, u, v, shown in seen:
         w, h = style.text_size(word, text_px, 600)[0] + 2 * pad, round(1.3 * text_px)
         corners = ((u - w // 2, v + r + 2), (u - w // 2, v - r - 2 - h))
         corners += ((u - r - 4 - w, v - h // 2), (u + r + 4, v - h // 2))
-        box = _free_place(view, corners, (w, h), taken, paths)
+        box = _free_place(view, corners, (w, h), taken + discs, paths)
         if box is not None:
             style.draw_panel(picture, box, panel, 0.7)
             at = (box[0] + pad, box[3] - round(0.33 * text_px))
@@ -92,6 +93,15 @@ def draw_tags(
             at = (box[0] + text_px // 4, box[3] - round(0.33 * text_px))
             style.draw_text(picture, tag.text, at, text_px, ink)
             taken.append(box)
+
+
+def _around(point_m: Array, view: View, radius: int) -> Box:
+    """The part of the picture about a point; an empty one where the point is behind the view."""
+    uv, depth = view.project(point_m[None])
+    if depth[0] <= 0:
+        return (-1, -1, -1, -1)
+    u, v = np.round(np.clip(uv[0], -1e6, 1e6)).astype(int).tolist()
+    return (u - radius, v - radius, u + radius, v + radius)
 
 
 def _free_place(

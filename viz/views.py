@@ -7,6 +7,7 @@ nothing.
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from pipelines.geometry import transform_points
 from pipelines.types import Array
@@ -17,9 +18,18 @@ SIDE_MARGIN, TOP_MARGIN, BOTTOM_MARGIN = 0.06, 0.15, 0.12
 TOP_DISTANCE = 60.0  # extents above the map: so far that heights hardly shift anything
 FIELD_OF_VIEW_DEG = 38.0  # of the three-quarter view, across the picture
 ELEVATION_DEG = 38.0  # it looks down so steeply
-AZIMUTHS_DEG = (-40.0, 40.0, -55.0, 55.0)  # and at such angles to the path, the first if alike
+AZIMUTHS_DEG = (
+    40.0,
+    55.0,
+    -40.0,
+    -55.0,
+)  # at such angles to the path: by the first two it goes right
+MUCH_NEARER = 0.75  # what one must gain in distance to be taken in place of one before it
 HAZE = 0.45  # the farthest points turn to the ground's colour so far
 ELONGATED = 0.3  # a path this long, against the map's extent, is followed; else the map is viewed
+STRAIGHT = 0.05  # so is a path this thin against its length that is this long against the map
+NEAR = (0.75, 0.25)  # of the map, what is as far from the path as three quarters of it are, or
+NEAR_FACTOR = 2.0  # twice as far as one quarter is; the rest need not be in the picture
 OUTSKIRTS = (0.05, 0.95)  # quantiles of the map a side: what is beyond need not be in the picture
 VIEW_NAMES = ("top", "iso")
 
@@ -51,9 +61,10 @@ def top_view(scene: Scene, size: tuple[int, int]) -> View:
 
 
 def iso_view(scene: Scene, size: tuple[int, int]) -> View:
-    """Of the whole from behind and above at an angle: the one of some that fills it the most.
+    """Of the whole from behind and above at an angle: one of some that fills the picture.
 
-    The map is what the camera saw, so it is looked at from where the camera looked.
+    The map is what the camera saw, so it is looked at from where the camera looked. The way goes to
+    the right, as one reads, unless the other side shows much more.
     """
     focal = 0.5 * size[0] / np.tan(np.radians(FIELD_OF_VIEW_DEG) / 2.0)
     framed = _framed(scene)
@@ -68,7 +79,7 @@ def iso_view(scene: Scene, size: tuple[int, int]) -> View:
         )
         T = _fit(R, framed, focal, size)
         middle_m = float(np.median(transform_points(T, framed)[:, 2]))
-        if middle_m < 0.98 * nearest_m:
+        if middle_m < MUCH_NEARER * nearest_m:
             best, nearest_m = T, middle_m
     depth = transform_points(best, framed)[:, 2]
     haze = (float(np.quantile(depth, 0.3)), float(np.quantile(depth, 0.98)), HAZE)
@@ -86,20 +97,24 @@ def _direction(scene: Scene, framed: Array) -> Array:
 
 
 def _framed(scene: Scene) -> Array:
-    """The points that must be in the picture: the path, and the map without its outskirts."""
+    """What must be in the picture: paths, and the map near them without its outskirts."""
+    ends = np.array([tag.point_m for tag in scene.tags]).reshape(-1, 3)
     if len(scene.points_m) < 20:
-        return np.concatenate([scene.path_m, scene.points_m, scene.path_m[:1] + 0.5])
-    low, high = np.quantile(scene.points_m, OUTSKIRTS, axis=0)
-    inside = ((scene.points_m >= low) & (scene.points_m <= high)).all(1)
-    return np.concatenate([scene.path_m, scene.points_m[inside]])
+        return np.concatenate([scene.path_m, ends, scene.points_m, scene.path_m[:1] + 0.5])
+    apart_m = cKDTree(scene.path_m).query(scene.points_m)[0]
+    most, some = np.quantile(apart_m, NEAR)
+    near = scene.points_m[apart_m <= max(most, NEAR_FACTOR * some)]
+    low, high = np.quantile(near, OUTSKIRTS, axis=0)
+    inside = ((near >= low) & (near <= high)).all(1)
+    return np.concatenate([scene.path_m, ends, near[inside]])
 
 
 def _long_axis(scene: Scene) -> Array:
     """Horizontal direction of greatest spread, towards the end of the path."""
     framed = _framed(scene)
     path = scene.path_m
-    spread = np.linalg.norm(np.ptp(path, axis=0))
-    cloud = path if spread > ELONGATED * np.linalg.norm(np.ptp(framed, axis=0)) else framed
+    spread = np.linalg.norm(np.ptp(path, axis=0)) / np.linalg.norm(np.ptp(framed, axis=0))
+    cloud = path if spread > (STRAIGHT if _is_straight(path) else ELONGATED) else framed
     flat = cloud - cloud.mean(0)
     flat = flat - np.outer(flat @ scene.up, scene.up)
     axis = np.linalg.svd(flat, full_matrices=False)[2][0] if len(flat) > 1 else scene.forward
@@ -110,6 +125,13 @@ def _long_axis(scene: Scene) -> Array:
     if abs(towards @ axis) < 1e-6:
         towards = scene.forward
     return _unit(axis) * (1.0 if towards @ axis >= 0 else -1.0)
+
+
+def _is_straight(path_m: Array) -> bool:
+    if len(path_m) < 3:
+        return False
+    length, width = np.linalg.svd(path_m - path_m.mean(0), compute_uv=False)[:2]
+    return bool(width < STRAIGHT * length)
 
 
 def _fit(R: Array, framed: Array, focal: float, size: tuple[int, int]) -> Array:

@@ -108,7 +108,7 @@ def test_true_objects_that_move_have_paths_with_gaps():
 
 def test_words_at_the_ends_of_the_path_hide_no_other_path():
     """They stand below, but above where a car drives close below the camera."""
-    for sides, is_above in (((1.2,), True), ((-5.0,), False)):
+    for sides, is_above in (((0.9,), True), ((-5.0,), False)):
         result = make_result(make_objects({j + 1: line(40, x) for j, x in enumerate(sides)}))
         scene = build_scene(result)
         view = choose_view("top", scene, SIZE)
@@ -123,3 +123,16 @@ def test_words_at_the_ends_of_the_path_hide_no_other_path():
         for j in range(len(sides)):
             of_car = (bare == style.object_color(j + 1)).all(2)
             assert of_car.any() and (picture[of_car] == style.object_color(j + 1)).all()
+
+
+def test_words_at_the_ends_of_the_path_lie_off_discs_that_come_later():
+    ahead = line(50)
+    ahead[:40] = np.nan
+    tracks = {1: line(40, 0.9), 2: line(40, -0.9), 3: ahead}  # so that all words hide some path
+    scene = build_scene(make_result(make_objects(tracks)))
+    view = choose_view("top", scene, SIZE)
+    taken = draw_ends(np.full((SIZE[1], SIZE[0], 3), 255, np.uint8), view, scene, [])
+    for tag in scene.tags:
+        (u, v), _ = (values[0] for values in view.project(tag.point_m[None]))
+        for left, top, right, bottom in taken[2:]:
+            assert not (left < u < right and top < v < bottom)

@@ -48,6 +48,22 @@ def test_all_plots(tmp_path):
         assert blue.sum() > 100, path.name
 
 
+def test_the_path_is_seen_from_above_where_the_first_camera_looked_down(tmp_path):
+    """In a hand: it turns about upright on a level circle of about a metre."""
+    level = [exp_se3(np.array([0.0, a, 0, 0, 0, 0])) for a in np.linspace(0.0, 2 * np.pi, 40)]
+    down = exp_se3(np.array([-0.6, 0.0, 0.0, 0.0, 0.0, -1.0]))
+    turned = np.array(level) @ down
+    Ts = np.linalg.inv(turned[0]) @ turned
+    writer = ResultWriter(tmp_path)
+    writer.write_camera([frame_result(k, T, status=TrackingStatus.OK) for k, T in enumerate(Ts)])
+    lines = {line.get_label(): line for line in figure_of(tmp_path, "trajectory").axes[0].lines}
+    circle = np.column_stack(lines["estimate"].get_data())
+    middle = (circle.max(0) + circle.min(0)) / 2
+    radii = np.linalg.norm(circle - middle, axis=1)
+    assert 0.9 < radii.mean() < 1.0
+    assert np.ptp(radii) < 0.02
+
+
 def test_only_what_the_files_allow(tmp_path):
     write(tmp_path / "a", 30, truth=False)
     assert [path.name for path in plot_result(tmp_path / "a")] == ["trajectory.png", "timings.png"]

@@ -95,6 +95,27 @@ def test_top_view_is_a_map_to_scale_along_the_picture():
     assert np.linalg.norm(high[0] - uv[0]) < 6.0  # heights hardly shift anything
 
 
+def test_a_short_drive_among_far_things_is_not_lost_in_the_picture():
+    Ts = drive(12, turn_rad=0.0)
+    far = np.random.default_rng(2).uniform([-60, -8, 90], [20, 0, 140], (400, 3))
+    near = np.random.default_rng(3).uniform([-10, -3, 5], [10, 1.5, 30], (1600, 3))
+    points = np.concatenate([near, far])
+    result = make_result(Ts, static_points_m=points, static_colors=np.zeros(points.shape, np.uint8))
+    scene = build_scene(result)
+    view = choose_view("top", scene, (1280, 720))
+    uv, _ = view.project(scene.path_m[[0, -1]])
+    assert uv[1, 0] - uv[0, 0] > 0.25 * 1280  # a quarter of the picture, although the map is 140 m
+    assert abs(uv[1, 1] - uv[0, 1]) < 4.0  # a straight way lies level, wherever the rest leads
+
+
+def test_a_drive_goes_to_the_right_unless_the_map_is_seen_badly_so():
+    for turn_rad in (-0.01, 0.0, 0.01):
+        scene = build_scene(make_result(drive(turn_rad=turn_rad)))
+        uv, depth = choose_view("iso", scene, (1280, 720)).project(scene.path_m)
+        assert uv[-1, 0] - uv[0, 0] > 300
+        assert depth[-1] > depth[0]
+
+
 def test_up_survives_a_tilted_first_camera():
     tilt = exp_se3(np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.0]))
     level = drive()

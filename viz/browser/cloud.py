@@ -28,13 +28,16 @@ class Cloud:
     """A map for the page. message: as meshcat's viewer takes it, packed.
 
     n_points: in it; n_all: in the map. scale_m: how far from the path near things are, by which
-    the view is sized. ground_m: height of the ground along the scene's up. extent_m: the lowest and
-    the highest of most points, each to the right, forward and up; empty where there are none.
+    the view is sized. up, forward: the scene's axes. ground_m: height of the ground along up.
+    extent_m: the lowest and the highest of most points, each to the right, forward and up; empty
+    where there are none.
     """
 
     message: bytes
     n_points: int
     n_all: int
+    up: list[float]
+    forward: list[float]
     scale_m: float
     ground_m: float
     extent_m: list[list[float]]
@@ -62,7 +65,8 @@ def build_cloud(
         chosen = np.sort(np.random.default_rng(_SEED).choice(n_all, max_points, replace=False))
         points_m, colors = points_m[chosen], colors[chosen]
     message = _message(points_m.astype(np.float32), colors)
-    return Cloud(message, len(points_m), n_all, *sizes)
+    up, forward = (axis.round(6).tolist() for axis in axes)
+    return Cloud(message, len(points_m), n_all, up, forward, *sizes)
 
 
 def _sizes(

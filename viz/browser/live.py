@@ -29,14 +29,14 @@ from viz.browser.live_server import LiveServer
 from viz.browser.pictures import LIVE, encode_jpeg
 from viz.browser.records import frame_record, page_setup
 from viz.overlay import draw_frame
+from viz.scene import level_axes
 
 WAITING = 4  # frames that wait with their images
 MAP_EVERY_S = 2.0
 PICTURE_EVERY_S = 0.25  # to draw each one would take the run half a core
 NICE = 10  # what the process of the pictures lets go before it
 MAX_LIVE_POINTS = 60_000  # as the map is sent anew each time
-# Up and forward of the first camera, whose axes the world has.
-_AXES = (np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+TILTED = np.cos(np.radians(2.0))  # what is known of up changes; by less, nothing is turned
 logger = logging.getLogger("dyob.viz")
 
 
@@ -98,6 +98,7 @@ class LiveViewer:
         setup = page_setup(sequence.name, None, sequence.camera)
         self._server = LiveServer(setup, host=self.host, port=self.port)
         self._frames = LiveFrames()
+        self._axes = level_axes(np.empty((0, 4, 4)))
         self._map = LiveMap(config.mapping.min_observations)
         self._have_moved, self._map_due_s = False, 0.0
         self._sketch: _Sketch | None = None  # the newest that is not drawn yet
@@ -218,8 +219,13 @@ class LiveViewer:
             self._server.tell_all_frames([_record(frame) for frame in self._frames.list])
         if self._have_moved or self._map.changed:
             Ts = self._frames.Ts_world_camera
+            axes = level_axes(Ts)
+            if axes[0] @ self._axes[0] < TILTED:
+                self._axes = axes
             points, colors = self._map.cloud(Ts)
-            self._server.tell_map(build_cloud(points, colors, Ts[:, :3, 3], _AXES, MAX_LIVE_POINTS))
+            if len(points):
+                seen = points, colors, Ts[:, :3, 3], self._axes
+                self._server.tell_map(build_cloud(*seen, max_points=MAX_LIVE_POINTS))
         self._have_moved = False
         self._map_due_s = time.monotonic() + MAP_EVERY_S
 

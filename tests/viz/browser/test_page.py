@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 from pipelines.config import Config
+from pipelines.frame_observations import FrameObservations, Sightings
+from pipelines.geometry import exp_se3, transform_points
 from pipelines.types import Frame, FrameResult, MotionHypothesis, TrackingStatus
 from viz.browser import export_scene
 from viz.browser.live import LiveViewer
@@ -173,6 +175,27 @@ def test_from_above_what_is_ahead_is_to_the_right(scene):
     scene.until("dyob.player.viewer.camera.aspect > 1")
 
 
+@pytest.mark.parametrize("size", [SIZE, {"width": 390, "height": 760}])
+def test_views_of_the_whole_lie_between_the_panels(scene, size):
+    scene.page.set_viewport_size(size)
+    scene.until(f"dyob.player.labels.width === {size['width']}")  # laid out anew
+    head, picture, controls = (
+        scene.page.locator(name).bounding_box() for name in ("#head", "#picture", "#controls")
+    )
+    for view in ("top", "free"):
+        scene.ask(f"dyob.view('{view}')")
+        places = scene.ask("dyob.player.frames.list.map((f) => dyob.player.labels.project(f.p))")
+        for k in range(8):
+            places += [box["pixel"] for box in scene.ask(f"(dyob.seek({k}), dyob.boxes())")]
+        for u, v, *_ in places:
+            assert 0 < u < size["width"]
+            assert head["y"] + head["height"] < v < controls["y"]
+            beside = u < picture["x"] or v > picture["y"] + picture["height"]
+            assert beside, (view, u, v)
+    scene.page.set_viewport_size(SIZE)
+    scene.until("dyob.player.viewer.camera.aspect > 1")
+
+
 def test_a_picture_of_before_the_batch_says_so(scene):
     scene.slide_to(2)
     assert "before the global batch" in scene.page.inner_text("#caption")
@@ -264,6 +287,40 @@ def test_a_live_run_is_seen_and_stays_when_it_is_over(browser, objects, tmp_path
         visit.context.close()
     said = capfd.readouterr().err
     assert "Traceback" not in said and "never retrieved" not in said
+
+
+def test_a_live_view_goes_by_the_map_that_comes(browser, tmp_path):
+    """A camera in a hand looks down at things close by: what is level shows as it turns about."""
+    urls: list[str] = []
+    viewer = LiveViewer(announce=urls.append)
+    camera = SimpleNamespace(cx=160, cy=60, fx=200, fy=200, width=320, height=120)
+    viewer.start(SimpleNamespace(name="a room", camera=camera), 20, Config(), tmp_path)
+    up = np.array([0.0, -np.cos(0.5), -np.sin(0.5)])  # the first camera looks down by half a rad
+    points = np.random.default_rng(0).uniform([-1, -0.5, 0.8], [1, 0.5, 2], (300, 3))
+    visit = Visit(browser, urls[0])
+    for k in range(20):
+        T = exp_se3(np.concatenate([-up * 0.05 * k, [0, 0, 0]]))
+        n = np.ones(len(points))
+        in_camera = transform_points(np.linalg.inv(T), points)
+        ids = np.arange(len(points))
+        uv = np.full((len(points), 2), 50.0)
+        sights = Sightings(np.full(len(ids), k), 0 * ids, ids, uv, n, n, n, in_camera)
+        seen = FrameObservations(k, 0.1 * k, True, T, sights)
+        result = FrameResult(
+            k, 0.1 * k, TrackingStatus.OK, T, np.zeros((6, 6)), MotionHypothesis.CONSTANT_VELOCITY,
+            k == 0, np.empty((0, 2)), np.empty(0, np.int64), np.empty(0, bool), 0.1,
+            observations=seen,
+        )  # fmt: skip
+        viewer.frame(Frame(k, 0.1 * k, np.zeros((120, 320, 3), np.uint8)), result)
+    visit.until("dyob.length === 20 && dyob.frame === 19")
+    viewer.finish()
+    visit.until("dyob.player.isOver")
+    assert visit.ask("document.getElementById('points').textContent") == "300 points"
+    np.testing.assert_allclose(visit.ask("dyob.player.world.axes.up.toArray()"), up, atol=0.06)
+    away = np.linalg.norm(visit.ask("dyob.player.viewer.camera.position.toArray()"))
+    assert 0.5 < away < 4  # the page opened before anything told that this is no street
+    assert visit.complaints == []
+    visit.context.close()
 
 
 def test_the_page_lives_in_a_frame_of_a_notebook(browser, result, tmp_path: Path):

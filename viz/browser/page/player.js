@@ -62,15 +62,13 @@ class Player {
   }
 
   setMap(bytes, facts) {
-    const first = !this.hasMap;
-    this.hasMap = true;
     this.world.setMap(bytes, facts);
     const thinned = facts.n_points < facts.n_all;
     const shown = facts.n_points.toLocaleString("en");
     const of = thinned ? ` of ${facts.n_all.toLocaleString("en")}` : "";
     byId("points").textContent = `${shown}${of} points`;
     this.showNotes();
-    if (first && this.isReady) this.views.set(this.views.mode);
+    if (this.isReady) this.views.again();
   }
 
   ready() {
@@ -210,6 +208,10 @@ class Player {
     this.labels.resize(width, height);
     const panels = [...document.querySelectorAll(".panel")].filter((panel) => !panel.hidden);
     this.labels.reserved = panels.map((panel) => panel.getBoundingClientRect());
+    if (byId("picture").classList.contains("large")) return;
+    const [head, picture, controls] = ["head", "picture", "controls"].map(
+      (id) => byId(id).getBoundingClientRect());
+    this.views.arrange({ head, picture: picture.width > LEAST_PX ? picture : null, controls });
     this.viewer.set_dirty();
   }
 

@@ -48,7 +48,7 @@ class World {
   }
 
   // up and forward are unit vectors of the world; meshcat's up is its z.
-  setup({ up, forward, camera, truth, palette }) {
+  turn({ up, forward }) {
     const { THREE } = MeshCat;
     const [f, u] = [new THREE.Vector3(...forward), new THREE.Vector3(...up)];
     const r = new THREE.Vector3().crossVectors(f, u);
@@ -56,6 +56,11 @@ class World {
     const turned = new THREE.Matrix4().set(
       r.x, r.y, r.z, 0, f.x, f.y, f.z, 0, u.x, u.y, u.z, 0, 0, 0, 0, 1);
     this.viewer.set_transform(["dyob"], turned.toArray());
+  }
+
+  setup({ up, forward, camera, truth, palette }) {
+    const { THREE } = MeshCat;
+    this.turn({ up, forward });
     this.aperture = camera;
     this.path = this.put(["camera", "path"], new FatLines("#5ab4ff", 3));
     this.frustum = this.put(["camera", "frustum"], new FatLines(palette.frustum, 2));
@@ -85,6 +90,7 @@ class World {
 
   setMap(bytes, facts) {
     this.facts = facts;
+    this.turn(facts);
     if (this.cloud) this.cloud.material = null; // meshcat disposes of what it replaces
     this.viewer.handle_command_bytearray(bytes);
     this.cloud = this.viewer.scene_tree.find(["dyob", "map", "<object>"]).object;
@@ -95,6 +101,20 @@ class World {
     this.drawFrustum();
     this.drawGrid();
     this.show();
+  }
+
+  // Points of the map without its outskirts, at most so many, in three's coordinates.
+  mapPoints(most) {
+    const [low, high] = this.facts.extent_m, found = [];
+    if (!this.cloud || !low) return found;
+    const { array } = this.cloud.geometry.attributes.position, { Vector3 } = MeshCat.THREE;
+    const step = 3 * Math.ceil(array.length / (3 * most));
+    for (let n = 0; n < array.length; n += step) {
+      const point = this.toThree(new Vector3(array[n], array[n + 1], array[n + 2]));
+      const placed = [point.x, -point.z, point.y];
+      if (placed.every((value, axis) => low[axis] <= value && value <= high[axis])) found.push(point);
+    }
+    return found;
   }
 
   pointMaterial() {
