@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 
 from pipelines.backend.batch_problem import BatchProblem, build_problem
 from pipelines.backend.batch_solver import solve
-from pipelines.backend.guard import CAMERA, Verdict, judge, keep_motions, misfit_motions
+from pipelines.backend.guard import (
+    CAMERA,
+    Verdict,
+    judge,
+    keep_motions,
+    lone_motions,
+    misfit_motions,
+)
 from pipelines.backend.held_out import hold_out
 from pipelines.backend.marginals import PoseCovariances
 from pipelines.backend.misfit import allow_for_noisy_views, learn_carried
@@ -120,7 +127,7 @@ def run_global_batch(
     result = as_result(problem, solution.problem, verdicts, costs, n_outliers)
     kept = result.kept_motions
     if config.guard:
-        kept = misfit_motions(problem, solution.problem, objects)
+        kept = misfit_motions(problem, solution.problem, objects) | lone_motions(problem)
     return with_motions(result, kept, covariances)
 
 

@@ -26,6 +26,7 @@ _RULED_OUT = 5.0 * 22.5
 _WILD_MPS = 1.0  # apart in speed, it is ruled out by the front-end's covariance alone
 _TOLERANCE = 1.002  # of an error, up to which it is as good as before
 _SIGNIFICANT = 1.0  # standard deviations of the growth, below which it may be chance
+_LONE = 2  # poses of a stretch that is a single motion
 MIN_HELD_OUT = 5  # sightings, fewer of which say nothing of an object
 CAMERA = 0  # body of the static world
 
@@ -138,6 +139,18 @@ def misfit_motions(
         wild &= growth[steps] > -_RULED_OUT  # else what was seen proves it
         found[steps] = ((growth[steps] > _RULED_OUT) | wild) & ~(surprise <= _RULED_OUT)
     return found
+
+
+def lone_motions(problem: BatchProblem) -> NDArray[np.bool_]:
+    """(O,) motions to object poses that have no other before or after them in their stretch.
+
+    Nothing is held out of them, and nothing makes them smoother: the front-end, which fused them
+    with what it expected, knows more.
+    """
+    lone: NDArray[np.bool_] = np.zeros(len(problem.Ts_world_object), bool)
+    for stretch in problem.stretches:
+        lone[stretch.poses] = len(stretch) <= _LONE
+    return lone
 
 
 def _front_end_motions(before: BatchProblem, after: BatchProblem) -> Array:

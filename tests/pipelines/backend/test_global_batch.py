@@ -159,6 +159,27 @@ def test_a_single_motion_that_gets_worse_stays_the_front_ends(make_drive, stereo
     assert np.isfinite(pose_std[:6]).all() and np.isnan(pose_std[6:]).all()
 
 
+@pytest.mark.parametrize("n_poses", [2, 3])
+def test_a_motion_without_neighbours_stays_the_front_ends(make_drive, stereo, monkeypatch, n_poses):
+    """There nothing makes it smoother, and nothing is held out to judge it by."""
+    drive = make_drive(3)
+    objects = drive.objects[np.arange(len(drive.objects)) < n_poses]
+    verdicts = tuple(Verdict(i, 100, 1.0, 1.0, 0.0) for i in (0, 1))
+    monkeypatch.setattr(global_batch, "judge", lambda *arguments: verdicts)
+    result = run_global_batch(stereo, drive.log, objects, CONFIG)
+    assert result.kept_motions.any() == (n_poses == 2)
+    rows, _ = objects_after(objects, drive.log, corrections(drive.log, result), result)
+    seen_before, seen = (
+        invert_T(T[1]) @ o.Hs_world_curr_prev[1] @ T[0]
+        for T, o in (
+            (result.before.Ts_world_camera, objects),
+            (result.after.Ts_world_camera, rows),
+        )
+    )
+    same = np.abs(seen - seen_before).max() < 1e-9
+    assert same == (n_poses == 2)
+
+
 def test_the_partial_batch_improves_and_joins_its_windows(make_drive, stereo):
     drive = make_drive(3, n_frames=24)
     config = replace(CONFIG, partial_window=8, partial_overlap=3)
