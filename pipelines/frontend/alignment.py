@@ -60,10 +60,7 @@ def align_patches(
 
 
 def is_precise(flow_sigma_px: float, alignment_sigma_px: float) -> bool:
-    """Whether flow is so much more precise than alignment that it needs none.
-
-    Such flow is no average over windows either: it ends where a depth edge is.
-    """
+    """Whether flow is so much more precise than alignment that it needs none."""
     return flow_sigma_px < _PRECISE_SHARE * alignment_sigma_px
 
 

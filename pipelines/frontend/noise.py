@@ -37,6 +37,8 @@ class NoiseModel:
             "orb": 0.9,
             "object_flow": 0.3,
             "object_alignment": 0.3,
+            "object_interior": 0.3,  # fused, off all depth edges, and beside them
+            "object_edge": 0.3,
         }
     )
     sigma_disparity_px: float = 0.5
@@ -62,6 +64,10 @@ class NoiseModel:
     def learn_uv(self, source: str, residuals_px: Array) -> None:
         """Take in the pixel residuals (N, 2) of one frame's inliers."""
         self.sigma_uv_px[source] = self._blend(source, self.sigma_uv_px[source], residuals_px)
+
+    def has_learned(self, source: str) -> bool:
+        """Whether residuals of a source were taken in yet."""
+        return source in self._seen
 
     def borrow(self, source: str, other: str) -> None:
         """Begin a source that taught nothing yet with the noise of another that did."""

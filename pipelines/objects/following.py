@@ -19,9 +19,8 @@ from pipelines.types import Array
 _TOLERANCE_PX = 6.0  # alignment may move a point this far from where it starts
 _SURE_PX = 1.5  # flow and expectation this near to each other say where to start, finely
 _NEAR_PX = 3.0  # how far the expected place itself may be off
-# Where all that surrounds a point is across a depth edge, it is so many times less precise again.
-# Measured by the errors of simulated drives and rooms.
-_EDGE_SIGMAS = 15.0
+_AT_EDGE = 0.2  # share of its surroundings across a depth edge, from which on a point is at one
+_MEAN_SHARE = 0.35  # of such points
 _SURPRISE_PX = 12.0  # flow that leads farther from the expected place is not of the object
 
 
@@ -30,7 +29,8 @@ class Followed:
     """Where points are in the present image (parallel arrays of length N).
 
     uv_px: (N, 2). valid: (N,) whether it was found at all. sigma_px: (N,). flow_px, aligned_px:
-    (N, 2) what each source said, NaN where nothing.
+    (N, 2) what each source said, NaN where nothing. across: (N,) share of the point's surroundings
+    that lies across a depth edge.
     """
 
     uv_px: Array
@@ -38,6 +38,7 @@ class Followed:
     sigma_px: Array
     flow_px: Array
     aligned_px: Array
+    across: Array
 
     def __getitem__(self, which: NDArray) -> Followed:
         """The points chosen by a boolean mask or an index array."""
@@ -47,7 +48,7 @@ class Followed:
     def empty(cls) -> Followed:
         """No points at all."""
         two = np.empty((0, 2))
-        return cls(two, np.empty(0, bool), np.empty(0), two, two)
+        return cls(two, np.empty(0, bool), np.empty(0), two, two, np.empty(0))
 
     @classmethod
     def concatenate(cls, *parts: Followed) -> Followed:
@@ -97,19 +98,28 @@ def follow_points(
         by_flow, has_flow & ~(contradict & expected & ~nearer), sigma_flow,
         aligned, has_alignment & ~(contradict & expected & nearer), sigma_aligned,
     )  # fmt: skip
-    sigma_px *= _beside_edge(view, uv, valid, noise)
+    across = np.zeros(n)
+    across[valid] = edge_share(view.disparity_px, uv[valid], noise.sigma_disparity_px)
+    sigma_px *= _beside_edge(across, noise)
     aligned[~has_alignment] = np.nan
     height, width = view.gray.shape
     with np.errstate(invalid="ignore"):
         inside = (uv >= 0).all(1) & (uv[:, 0] <= width - 1) & (uv[:, 1] <= height - 1)
-    return Followed(uv, valid & inside, sigma_px, by_flow, aligned)
+    return Followed(uv, valid & inside, sigma_px, by_flow, aligned, across)
 
 
-def _beside_edge(view: View, uv_px: Array, valid: NDArray[np.bool_], noise: NoiseModel) -> Array:
-    """(N,) how many times less precise points are for the depth edges about them."""
-    factor = np.ones(len(uv_px))
-    flow_px, aligned_px = noise.sigma_uv_px["object_flow"], noise.sigma_uv_px["object_alignment"]
-    if view.flow_prev_to_curr_px is None or not is_precise(flow_px, aligned_px):
-        across = edge_share(view.disparity_px, uv_px[valid], noise.sigma_disparity_px)
-        factor[valid] += _EDGE_SIGMAS * across
-    return factor
+def _beside_edge(across: Array, noise: NoiseModel) -> Array:
+    """(N,) how many times less precise points are for shares of their surroundings over an edge."""
+    if not (noise.has_learned("object_interior") and noise.has_learned("object_edge")):
+        return np.ones(len(across))
+    at_edge = noise.sigma_uv_px["object_edge"] / noise.sigma_uv_px["object_interior"]
+    return 1.0 + max(at_edge - 1.0, 0.0) * across / _MEAN_SHARE
+
+
+def learn_edges(residuals_px: Array, across: Array, noise: NoiseModel) -> None:
+    """Take in residuals (N, 2) of followed points, with shares (N,) of what is across an edge.
+
+    Windows that reach over an edge are dragged along by what moves there; exact flow is not.
+    """
+    noise.learn_uv("object_interior", residuals_px[across == 0.0])
+    noise.learn_uv("object_edge", residuals_px[across >= _AT_EDGE])

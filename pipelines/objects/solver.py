@@ -17,7 +17,7 @@ from pipelines.frontend.sampling import sample_disparity
 from pipelines.frontend.sensor import Sensor
 from pipelines.geometry import backproject, invert_T
 from pipelines.mapping.point_filter import refine_points
-from pipelines.objects.following import Followed
+from pipelines.objects.following import Followed, learn_edges
 from pipelines.objects.instances import middle_of
 from pipelines.objects.motion import Motions, estimate_motions, move_points
 from pipelines.objects.points import ObjectPoints, create_points
@@ -111,6 +111,8 @@ class MotionSolver:
         motions = solution.motions
         good = solution.agrees
         predicted = followed.uv_px - motions.residuals_px[:, :2]
+        residual = motions.residuals_px[good, :2]
+        learn_edges(residual, followed.across[good], self.sensor.noise)
         sources = {"object_flow": followed.flow_px, "object_alignment": followed.aligned_px}
         for source, uv in sources.items():
             residual = (uv - predicted)[good]

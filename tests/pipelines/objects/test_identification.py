@@ -1,5 +1,7 @@
 """Detections given lasting ids by points, boxes and gates; and masks of what was missed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -37,7 +39,7 @@ def points_in(object_id, part, n=30, shift=(0.0, 0.0), seed=0):
         np.full(n, object_id), np.ones((n, 3)), np.zeros((n, 3, 3)), uv, np.arange(n)
     )
     now = uv + shift
-    return points, Followed(now, np.ones(n, bool), np.full(n, 0.3), now, now)
+    return points, Followed(now, np.ones(n, bool), np.full(n, 0.3), now, now, np.zeros(n))
 
 
 def track_at(object_id, part=None, center_m=None, **changes):
@@ -102,9 +104,7 @@ def test_a_box_speaks_for_an_object_without_points_while_it_is_fresh(kitti):
 def test_points_of_unknown_objects_and_lost_points_do_not_count(kitti):
     seen = instances_at(kitti, LEFT, disparity_px=np.nan)
     points, followed = points_in(3, LEFT)
-    lost = Followed(
-        followed.uv_px * np.nan, ~followed.valid, followed.sigma_px, followed.uv_px, followed.uv_px
-    )
+    lost = replace(followed, uv_px=followed.uv_px * np.nan, valid=~followed.valid)
     assert identify({3: track_at(3, area_px=99)}, seen, points, lost, np.eye(4)) == {}
     assert identify({8: track_at(8, area_px=99)}, seen, points, followed, np.eye(4)) == {}
 

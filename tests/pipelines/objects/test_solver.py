@@ -34,7 +34,9 @@ def followed_by(kitti, points, G, rng, sigma_px=0.1):
     uv = project_stereo(kitti, transform_points(G, points.position_m))[:, :2]
     uv = uv + rng.normal(0, sigma_px, uv.shape)
     n = len(uv)
-    return Followed(uv, np.ones(n, bool), np.full(n, sigma_px), uv, np.full((n, 2), np.nan))
+    return Followed(
+        uv, np.ones(n, bool), np.full(n, sigma_px), uv, np.full((n, 2), np.nan), np.zeros(n)
+    )
 
 
 def solve(solver, points, followed, G=None, z_m=12.0):
@@ -74,7 +76,9 @@ def test_too_few_that_agree_are_no_proof(kitti, solver, n_agree, believed):
     stray[n_agree:] += rng.choice([-1, 1], (100 - n_agree, 2)) * rng.uniform(
         30, 200, (100 - n_agree, 2)
     )
-    followed = Followed(stray, followed.valid, followed.sigma_px, stray, followed.aligned_px)
+    followed = Followed(
+        stray, followed.valid, followed.sigma_px, stray, followed.aligned_px, followed.across
+    )
     solution = solve(solver, points, followed, G, z_m=11.5)
     assert solution.accepted.tolist() == [believed]
     assert (len(solver.refine(solution)) > 0) == believed
@@ -97,11 +101,13 @@ def test_objects_teach_the_noise_of_their_flow(kitti, solver):
     rng = np.random.default_rng(3)
     points = wall_points(solver, rng, 200)
     noise = solver.sensor.noise
-    others = {k: v for k, v in noise.sigma_uv_px.items() if k != "object_flow"}
+    learned = ("object_flow", "object_interior")
+    others = {k: v for k, v in noise.sigma_uv_px.items() if k not in learned}
     for _ in range(8):
         solve(solver, points, followed_by(kitti, points, G, rng, 0.12), G, z_m=11.5)
-    assert noise.sigma_uv_px["object_flow"] == pytest.approx(0.12, rel=0.2)
-    assert {k: v for k, v in noise.sigma_uv_px.items() if k != "object_flow"} == others
+    for source in learned:
+        assert noise.sigma_uv_px[source] == pytest.approx(0.12, rel=0.2)
+    assert {k: v for k, v in noise.sigma_uv_px.items() if k not in learned} == others
 
 
 def test_depth_that_says_nothing_is_not_used(kitti, solver):
