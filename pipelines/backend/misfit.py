@@ -57,17 +57,6 @@ def allow_for_noisy_views(problem: BatchProblem) -> BatchProblem:
     return problem.with_tracks(tracks.with_sigmas(*sigmas_px), problem.sighting_rows)
 
 
-def _medians(values: Array, group: NDArray[np.int64], n: int) -> Array:
-    """(n,) medians of the values (N,) of each group; 0 where there are none."""
-    order = np.lexsort((values, group))
-    sizes = np.bincount(group, minlength=n)
-    starts = np.cumsum(sizes) - sizes
-    found = sizes > 0
-    medians = np.zeros(n)
-    medians[found] = values[order][(starts + sizes // 2)[found]]
-    return medians
-
-
 def learn_carried(problem: BatchProblem) -> BatchProblem:
     """The same problem with the share of a static sighting's error that goes on in the next one.
 
@@ -85,9 +74,10 @@ def learn_carried(problem: BatchProblem) -> BatchProblem:
     alone = replace(tracks, carried=np.zeros(len(tracks)))
     points = settle_points(problem.camera, alone, views, problem.points_m)
     off = misses_px(problem.camera, tracks.uv_px, camera_points(tracks, views, points))
-    growth = np.median(np.abs(off[far] - off[far - _FAR])) / np.median(
-        np.abs(off[far] - off[far - 1])
-    )
+    apart_px = [float(np.median(np.abs(off[far] - off[far - lag]))) for lag in (1, _FAR)]
+    if apart_px[0] == 0.0:
+        return problem  # nothing ever moves, nor errs
+    growth = apart_px[1] / apart_px[0]
     shares = np.linspace(_LEAST_CARRIED, 1.0, 200, endpoint=False)
     expected = np.sqrt((1.0 - shares**_FAR) / (1.0 - shares))
     carried = float(np.interp(growth, expected, shares, right=1.0))
@@ -96,3 +86,14 @@ def learn_carried(problem: BatchProblem) -> BatchProblem:
     sigma = tracks.sigma_uv_px * np.where(static, np.sqrt(0.5 * (1.0 + carried)), 1.0)
     learned = replace(tracks, carried=np.where(static, carried, tracks.carried), sigma_uv_px=sigma)
     return problem.with_tracks(learned, problem.sighting_rows)
+
+
+def _medians(values: Array, group: NDArray[np.int64], n: int) -> Array:
+    """(n,) medians of the values (N,) of each group; 0 where there are none."""
+    order = np.lexsort((values, group))
+    sizes = np.bincount(group, minlength=n)
+    starts = np.cumsum(sizes) - sizes
+    found = sizes > 0
+    medians = np.zeros(n)
+    medians[found] = values[order][(starts + sizes // 2)[found]]
+    return medians
