@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipelines.backend.batch_problem import BatchProblem, build_problem
 from pipelines.backend.batch_solver import solve
+from pipelines.backend.carried_errors import learn_carried
 from pipelines.backend.guard import (
     CAMERA,
     Verdict,
@@ -24,7 +25,7 @@ from pipelines.backend.guard import (
 )
 from pipelines.backend.held_out import hold_out
 from pipelines.backend.marginals import PoseCovariances
-from pipelines.backend.misfit import allow_for_noisy_views, learn_carried
+from pipelines.backend.misfit import allow_for_noisy_views
 from pipelines.backend.object_graph import pose_graph
 from pipelines.backend.point_elimination import Residuals
 from pipelines.backend.score_bootstrap import bootstrap_covariances

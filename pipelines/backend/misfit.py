@@ -5,22 +5,16 @@ Owns the squared errors that verdicts and weights are made of. Solves nothing.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.backend.batch_problem import BatchProblem
-from pipelines.backend.held_out import misses_px
-from pipelines.backend.point_elimination import camera_points, evaluate, settle_points
+from pipelines.backend.point_elimination import evaluate, settle_points
 from pipelines.types import Array
 
 _BEHIND = 100.0  # squared standard deviations that a point behind the camera counts as
 _NOISY = 2.0  # times the median misfit of all objects, from which on a view of one is noisy
 _MAX_NOISE_FACTOR = 4.0  # of its standard deviations then
-_FAR = 8  # frames, over which the growth of errors is measured
-_MIN_SAMPLES = 200  # fewer pairs of sightings so far apart say nothing of it
-_LEAST_CARRIED = 0.05  # nothing at all would count as not followed
 
 
 def squared_misfits(problem: BatchProblem) -> Array:
@@ -55,37 +49,6 @@ def allow_for_noisy_views(problem: BatchProblem) -> BatchProblem:
     tracks = problem.tracks
     sigmas_px = (tracks.sigma_uv_px * by_sighting, tracks.sigma_disparity_px * by_sighting)
     return problem.with_tracks(tracks.with_sigmas(*sigmas_px), problem.sighting_rows)
-
-
-def learn_carried(problem: BatchProblem) -> BatchProblem:
-    """The same problem with the share of a static sighting's error that goes on in the next one.
-
-    Where points are aligned to their first sight, errors are partly new in every frame; where flow
-    or worn patches lead from frame to frame they walk. How much farther errors come apart over some
-    frames than over one tells, at the front-end's poses: both are a first-order Markov process.
-    """
-    tracks = problem.tracks
-    far = np.arange(_FAR, len(tracks))
-    run = np.cumsum(~tracks.is_followed)
-    far = far[(run[far] == run[far - _FAR]) & (tracks.view[far] < problem.n_frames)]
-    if len(far) < _MIN_SAMPLES:
-        return problem
-    views = problem.views(problem.Ts_world_camera, problem.Ts_world_object)
-    alone = replace(tracks, carried=np.zeros(len(tracks)))
-    points = settle_points(problem.camera, alone, views, problem.points_m)
-    off = misses_px(problem.camera, tracks.uv_px, camera_points(tracks, views, points))
-    apart_px = [float(np.median(np.abs(off[far] - off[far - lag]))) for lag in (1, _FAR)]
-    if apart_px[0] == 0.0:
-        return problem  # nothing ever moves, nor errs
-    growth = apart_px[1] / apart_px[0]
-    shares = np.linspace(_LEAST_CARRIED, 1.0, 200, endpoint=False)
-    expected = np.sqrt((1.0 - shares**_FAR) / (1.0 - shares))
-    carried = float(np.interp(growth, expected, shares, right=1.0))
-    static = tracks.is_followed & (tracks.view < problem.n_frames)
-    # What is told of a step is of the difference of two errors
-    sigma = tracks.sigma_uv_px * np.where(static, np.sqrt(0.5 * (1.0 + carried)), 1.0)
-    learned = replace(tracks, carried=np.where(static, carried, tracks.carried), sigma_uv_px=sigma)
-    return problem.with_tracks(learned, problem.sighting_rows)
 
 
 def _medians(values: Array, group: NDArray[np.int64], n: int) -> Array:

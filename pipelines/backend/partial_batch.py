@@ -14,10 +14,10 @@ import numpy as np
 
 from pipelines.backend.batch_problem import BatchProblem, build_problem
 from pipelines.backend.batch_solver import solve
+from pipelines.backend.carried_errors import learn_carried
 from pipelines.backend.global_batch import BatchResult, as_result, has_enough, inliers
 from pipelines.backend.guard import judge
 from pipelines.backend.held_out import hold_out
-from pipelines.backend.misfit import learn_carried
 from pipelines.backend.object_graph import pose_graph
 from pipelines.backend.point_elimination import settle_points
 from pipelines.backend.point_tracks import Index, PointTracks

@@ -9,13 +9,14 @@ poses is their covariance: the bootstrap form of the cluster-robust sandwich H^-
 What errs over the whole of a body as if it had moved leaves no residual. It is told from the two
 scales that do: by as much as patches make variances wider than single tracks, the whole body is
 taken to make them wider than patches, which lie about half way between in scale. White noise shows
-no such growth, and gets none. Measured on degraded drives and rooms: standard deviations of steps
-come true within a tenth by it, where the model's were half of what they should be.
+no such growth, and gets none. Measured as errors over standard deviations, by the model in
+brackets: on eight degraded drives and rooms 0.9 (1.4) for steps of the camera, 1.1 (1.9) for its
+poses, 1.0 (1.5) for motions of objects and 1.2 (2.6) for their poses; on four streets and crossings
+0.8 (1.9), 0.9 (2.6), 1.3 (2.2) and 1.6 (3.3).
 """
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ from pipelines.geometry import invert_T
 from pipelines.types import Array
 
 _DRAWS = 200  # 5 % of a standard deviation
-_WORLD_PATCHES, _OBJECT_PATCHES = 32, 12  # of the image, and of what is seen of an object
+_WORLD_PATCHES, _OBJECT_PATCHES = 32, 4  # of the image, and of what is seen of an object
 _POSE_NUMBERS, _GROUP_NUMBERS = 6.0, 2.0  # of a view, and of the mean error of a group in it
 _MOST_LEVERAGE = 0.5
 _SLIGHT_DAMPING = 1e-6  # of points: some are hardly held at all
@@ -198,14 +199,22 @@ def _of_samples(problem: BatchProblem, samples: Array) -> PoseCovariances:
 def _carried_on(of_tracks: PoseCovariances, of_patches: PoseCovariances) -> PoseCovariances:
     """From tracks to patches to whole bodies: variances grow once more as they did between these.
 
-    By one factor for all poses of a kind, as that of a single pose is uncertain itself.
+    By one factor for all poses of a kind, as that of a single pose is uncertain itself. That of
+    poses is at least that of their steps: what errs over many frames is drawn but a few times.
     """
-    arrays = []
-    for field in fields(of_patches):
+
+    def growth(name: str) -> float:
         fine, coarse = (
-            np.diagonal(getattr(of, field.name), axis1=1, axis2=2) for of in (of_tracks, of_patches)
+            np.diagonal(getattr(of, name), axis1=1, axis2=2) for of in (of_tracks, of_patches)
         )
         known = (fine > 0.0) & (coarse > 0.0)
-        growth = np.exp(np.log(coarse[known] / fine[known]).mean()) if known.any() else 1.0
-        arrays.append(max(float(growth), 1.0) * getattr(of_patches, field.name))
-    return PoseCovariances(*arrays)
+        return float(np.exp(np.log(coarse[known] / fine[known]).mean())) if known.any() else 1.0
+
+    def carried_on(poses: str, steps: str) -> tuple[Array, Array]:
+        of_poses, of_steps = max(growth(poses), 1.0), max(growth(steps), 1.0)
+        return (
+            max(of_poses, of_steps**2 / of_poses) * getattr(of_patches, poses),
+            of_steps * getattr(of_patches, steps),
+        )
+
+    return PoseCovariances(*carried_on("cameras", "camera_steps"), *carried_on("objects", "steps"))
