@@ -66,13 +66,13 @@ _CLASSES = {
     "frontend.hypotheses": ("ConstantVelocity",),
     "frontend.measurement": ("LastFrame",),
     "frontend.noise": ("NoiseModel",),
-    "frontend.patches": ("Patches",),
     "frontend.sensor": ("Sensor",),
     "frontend.tracking": ("Tracker",),
     "frontend.view": ("View",),
     "mapping.correction": ("FrameAnchors",),
     "mapping.keyframe": ("Keyframe",),
     "mapping.local_mapping": ("LocalMapping",),
+    "mapping.patch_album": ("PatchAlbum",),
     "mapping.sparse_map": ("SparseMap",),
     "object_types": ("ObjectEstimates", "ObjectState"),
     "objects.frame": ("LastObjects",),
@@ -83,6 +83,7 @@ _CLASSES = {
     "objects.track": ("ObjectTrack",),
     "objects.tracking": ("ObjectTracker",),
     "observations": ("Tracks",),
+    "patches": ("Patches",),
     "types": ("Features", "Frame", "FrameResult", "MotionHypothesis", "TrackingStatus"),
 }
 _LASTING = ("mapping.keyframe.Keyframe", "types.FrameResult")

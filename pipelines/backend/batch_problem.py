@@ -217,16 +217,22 @@ def _last_positions(problem: BatchProblem, position_m: Array) -> Array:
 
 
 def weigh(tracks: PointTracks) -> PointTracks:
-    """The tracks with pixel sigmas raised by how far they outnumber their witnesses."""
+    """The tracks with pixel sigmas raised by how far they outnumber their witnesses.
+
+    Points found again are witnesses of their own: what led the others here did not lead them.
+    """
+    begins = np.zeros(len(tracks), bool)
+    begins[tracks.starts] = True
+    group = 2 * tracks.view + (~tracks.is_followed & ~begins)
     cell = np.floor(tracks.uv_px / _CORRELATION_PX).astype(np.int64)
     cell -= cell.min(0, initial=0)
-    key = (tracks.view * (cell[:, 1].max(initial=0) + 1) + cell[:, 1]) * (
+    key = (group * (cell[:, 1].max(initial=0) + 1) + cell[:, 1]) * (
         cell[:, 0].max(initial=0) + 1
     ) + cell[:, 0]
     _, first = np.unique(key, return_index=True)
-    n_cells = np.bincount(tracks.view[first], minlength=tracks.n_views)
-    n_points = np.bincount(tracks.view, minlength=tracks.n_views)
-    factor = np.sqrt(n_points / np.maximum(n_cells, 1))[tracks.view]
+    n_cells = np.bincount(group[first], minlength=2 * tracks.n_views)
+    n_points = np.bincount(group, minlength=2 * tracks.n_views)
+    factor = np.sqrt(n_points / np.maximum(n_cells, 1))[group]
     return tracks.with_sigmas(tracks.sigma_uv_px * factor, tracks.sigma_disparity_px)
 
 

@@ -28,8 +28,8 @@ class KeyframeSightings:
     keyframes: (K,) rows in the map, ascending. frame_index: (K,). Ts_world_camera: (K, 4, 4).
     view: (M,) rows of these. point_ids: (M,), of points that are alive. uv_px: (M, 2).
     disparity_px: (M,) with the offset as it is known by now, NaN where unknown. sigma_uv_px: (M,)
-    of a step from the frame before. sigma_disparity_px: of all. sigma_found_px: of a point that was
-    not followed there but found by its descriptor.
+    of a step from the frame before. sigma_disparity_px: of all. sigma_found_px: (M,) of a
+    place where a point was not followed to, but found again.
     """
 
     camera: StereoCamera
@@ -42,7 +42,7 @@ class KeyframeSightings:
     disparity_px: Array
     sigma_uv_px: Array
     sigma_disparity_px: float
-    sigma_found_px: float
+    sigma_found_px: Array
 
     def __len__(self) -> int:
         return len(self.view)
@@ -53,7 +53,7 @@ def copy_sightings(
 ) -> KeyframeSightings:
     """What some keyframes (ascending) saw of the points that are wanted, by their ids (N,)."""
     chosen = [sparse_map.keyframes[k] for k in keyframes.tolist()]
-    offset_px = sensor.offset.offset_px
+    offset_px, sigma_uv_px = sensor.offset.offset_px, sensor.noise.sigma_uv_px
     ids = np.concatenate([k.tracks.point_ids for k in chosen])
     keep = wanted[ids]
     disparity_px = [
@@ -71,7 +71,7 @@ def copy_sightings(
         np.concatenate(disparity_px)[keep],
         np.concatenate([k.tracks.sigma_uv_px for k in chosen])[keep],
         sensor.noise.sigma_disparity_px,
-        sensor.noise.sigma_uv_px["orb"],
+        np.where(sparse_map.album.has(ids[keep]), sigma_uv_px["looks"], sigma_uv_px["orb"]),
     )
 
 
@@ -94,7 +94,7 @@ def to_tracks(seen: KeyframeSightings, most_per_keyframe: int = 0) -> tuple[Poin
     sigma_uv_px = np.where(
         followed,
         sigma * np.sqrt(frames),
-        np.where(known, np.hypot(sigma, seen.sigma_found_px), _FIRST_SIGMA_PX),
+        np.where(known, np.hypot(sigma, seen.sigma_found_px[order]), _FIRST_SIGMA_PX),
     )
     tracks = PointTracks(
         view,

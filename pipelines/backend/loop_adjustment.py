@@ -108,6 +108,7 @@ def join_points(seen: KeyframeSightings, pairs: Pairs, n_points: int) -> Keyfram
         uv_px=seen.uv_px[rows],
         disparity_px=seen.disparity_px[rows],
         sigma_uv_px=seen.sigma_uv_px[rows],
+        sigma_found_px=seen.sigma_found_px[rows],
     )
 
 

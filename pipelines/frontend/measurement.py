@@ -1,6 +1,7 @@
-"""Where known points are in a view: those of the last frame, and those of the local map.
+"""Where the points of the last frame are in a view.
 
-Owns the search for points by flow, by ORB descriptors and by patch alignment. Estimates no pose.
+Owns the search for them by flow, by ORB descriptors and by patch alignment. Estimates no pose; the
+points of the local map are for `map_search`.
 """
 
 from __future__ import annotations
@@ -14,18 +15,17 @@ from scipy.spatial import cKDTree
 from pipelines.config import TrackingConfig
 from pipelines.frontend.alignment import align_patches, fuse_measurements, is_precise
 from pipelines.frontend.matching import match_in_radius
-from pipelines.frontend.patches import Patches
 from pipelines.frontend.sampling import sample_bilinear
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
 from pipelines.geometry import MIN_DEPTH_M, invert_T, project_stereo, transform_points
 from pipelines.mapping.sparse_map import SparseMap
 from pipelines.observations import Tracks
+from pipelines.patches import Patches
 from pipelines.types import Array, StereoCamera
 
 _ALIGNMENT_TOLERANCE_PX = 10.0  # alignment may move a point this far from an ORB match
 _DRIFT_PX = 2.0  # a place this far from where the start, or the last frame, has it is another one
-_TAKEN_PX = 3.0  # a feature this near a tracked point is that point
 _NEIGHBOURS = 5  # matched points that predict the place of an unmatched one
 
 
@@ -176,40 +176,3 @@ def _places_to_start(
         start[missing[unmatched]] += np.median(shift[nearest], axis=1)
     start[missing[matched]] += shift
     return start
-
-
-def search_local_map(
-    view: View,
-    sparse_map: SparseMap,
-    tracks: Tracks,
-    T_world_camera: Array,
-    sensor: Sensor,
-    config: TrackingConfig,
-) -> tuple[Tracks, NDArray[np.int64]]:
-    """Points of the local map found again in this view, and the ids of all that were in view.
-
-    tracks: points already measured, which are not searched for, nor are their features taken.
-    T_world_camera: (4, 4), good to some pixels. Paper, sections ORB Feature Extraction, Sparse Map.
-    """
-    ids, predicted = sparse_map.local_points(T_world_camera, tracks.point_ids)
-    on_static = view.is_static(predicted)
-    ids, predicted = ids[on_static], predicted[on_static]
-    features = view.features
-    if len(ids) == 0 or len(features) == 0:
-        return Tracks.empty(), ids
-    taken = np.zeros(len(features), bool)
-    if len(tracks):
-        distance, _ = cKDTree(tracks.uv_px).query(features.uv_px, distance_upper_bound=_TAKEN_PX)
-        taken = np.isfinite(distance)
-    free = np.flatnonzero(~taken)
-    matched, chosen = match_in_radius(
-        predicted,
-        sparse_map.descriptor[ids],
-        features.uv_px[free],
-        features.descriptors[free],
-        config.map_radius_px,
-        config.max_hamming,
-    )
-    uv = features.uv_px[free[chosen]]
-    sigma = np.full(len(uv), sensor.noise.sigma_uv_px["orb"])
-    return Tracks(ids[matched], uv, sensor.read_close_disparity(view, uv), sigma), ids

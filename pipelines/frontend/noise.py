@@ -35,6 +35,7 @@ class NoiseModel:
             "flow": 0.3,
             "alignment": 0.3,
             "orb": 0.9,
+            "looks": 0.9,  # of points of the map that are found again
             "object_flow": 0.3,
             "object_alignment": 0.3,
             "object_interior": 0.3,  # fused, off all depth edges, and beside them

@@ -20,15 +20,15 @@ from pipelines.frontend.hypotheses import (
     estimate_pnp,
     reprojection_inliers,
 )
+from pipelines.frontend.map_search import search_local_map
 from pipelines.frontend.matching import match_all
 from pipelines.frontend.measurement import (
     LastFrame,
     Measurement,
     measure_points,
-    search_local_map,
 )
 from pipelines.frontend.motion_only_ba import PoseEstimate, estimate_camera_pose
-from pipelines.frontend.patches import Patches, Shot, renew_patches
+from pipelines.frontend.patch_cutting import Shot, renew_patches
 from pipelines.frontend.rgbd_odometry import estimate_rgbd_odometry
 from pipelines.frontend.sensor import Sensor
 from pipelines.frontend.view import View
@@ -36,6 +36,7 @@ from pipelines.geometry import invert_T, project_stereo, rotation_angle_deg, tra
 from pipelines.mapping.fusion import rename_points
 from pipelines.mapping.sparse_map import SparseMap
 from pipelines.observations import Tracks
+from pipelines.patches import Patches
 from pipelines.types import Array, MotionHypothesis, TrackingStatus
 
 _SEEN_ALIKE_DEG = 1.0  # turned by less, a patch looks the same
@@ -117,7 +118,10 @@ class Tracker:
         depth_m = transform_points(invert_T(T_world_camera), points)[:, 2]
         shot = Shot(self.camera, view, T_world_camera, self.noise.sigma_disparity_px)
         old = Patches.empty() if self._last is None else self._last.patches
+        back = np.setdiff1d(tracks.point_ids, old.point_ids)
+        old = Patches.concatenate(old, sparse_map.kept_patches(back))
         patches = renew_patches(old, shot, tracks, depth_m)
+        sparse_map.keep_patches(patches)
         self._last = LastFrame(view, tracks, patches=patches)
 
     def forget_flow(self) -> None:
@@ -165,15 +169,18 @@ class Tracker:
             estimate = self._adjust(sparse_map, measured.tracks, estimate.T_world_camera)
         with stage("local_map"):
             T, tracks = estimate.T_world_camera, measured.tracks
-            found, visible = search_local_map(view, sparse_map, tracks, T, self.sensor, self.config)
+            self.noise.borrow("looks", "orb")
+            found_again = search_local_map(view, sparse_map, tracks, T, self.sensor, self.config)
+            found, visible = found_again.tracks, found_again.visible_ids
             if not measured.sources_px:  # recognised by features alone, as coarse in depth
-                found = replace(found, disparity_px=np.full(len(found), np.nan))
+                coarse = np.where(found_again.by_looks, found.disparity_px, np.nan)
+                found = replace(found, disparity_px=coarse)
             if len(found):
                 tracks = Tracks.concatenate(tracks, found)
                 estimate = self._adjust(sparse_map, tracks, T, robust_rounds=1)
                 if not self._is_trusted(estimate, T_predicted, hypothesis):
                     return self._lost(T_predicted, tracks)
-                self._learn_orb_noise(estimate, len(measured.tracks))
+                self._learn_found_noise(estimate, found_again.by_looks)
         is_jump = self._is_jump(hypothesis, estimate.T_world_camera, T_predicted)
         in_sight = min(len(measured.tracks) + len(visible), len(view.features))
         if is_jump and estimate.n_inliers < _RECOGNISED_SHARE * in_sight:
@@ -381,6 +388,10 @@ class Tracker:
         disparity = r[:, 0] - r[:, 2]
         self.noise.learn_disparity(disparity[np.isfinite(disparity)])
 
-    def _learn_orb_noise(self, estimate: PoseEstimate, n_measured: int) -> None:
-        r = estimate.residuals_px[n_measured:][estimate.inliers[n_measured:]]
-        self.noise.learn_uv("orb", r[:, :2])
+    def _learn_found_noise(self, estimate: PoseEstimate, by_looks: NDArray[np.bool_]) -> None:
+        """by_looks: (N,) of the last N observations, which were found again in the local map."""
+        n = len(estimate.inliers) - len(by_looks)
+        good = estimate.inliers[n:]
+        r = estimate.residuals_px[n:, :2]
+        self.noise.learn_uv("looks", r[good & by_looks])
+        self.noise.learn_uv("orb", r[good & ~by_looks])

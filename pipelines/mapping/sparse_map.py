@@ -22,7 +22,9 @@ from pipelines.geometry import (
     transform_points,
 )
 from pipelines.mapping.keyframe import Keyframe
+from pipelines.mapping.patch_album import PatchAlbum
 from pipelines.observations import StereoObservations, Tracks
+from pipelines.patches import Patches
 from pipelines.types import Array, StaticMap, StereoCamera, check_shape
 
 Ids = NDArray[np.int64]
@@ -30,6 +32,7 @@ Ids = NDArray[np.int64]
 _FIRST_CAPACITY = 4096  # rows; doubled whenever they are full
 _MIN_CHANCES = 8  # frames that should have seen a point before its found ratio counts
 _NEIGHBOURS = 5  # covisible keyframes that each keyframe brings into the local map
+_LASTING = 3  # keyframes that saw a point whose looks are worth keeping
 _SAME_DIRECTION_DEG = 40.0  # optical axes closer than this look at the same things
 
 _COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {
@@ -50,8 +53,9 @@ _COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {
 class SparseMap:
     """Points and keyframes of the static world.
 
-    Attributes named in `_COLUMNS` are arrays of capacity N; a point's id is its row. Rows of points
-    that died before any keyframe saw them are used again.
+    album: how points looked that are out of sight. Attributes named in `_COLUMNS` are arrays of
+    capacity N; a point's id is its row. Rows of points that died before any keyframe saw them are
+    used again.
     """
 
     position_m: Array
@@ -69,6 +73,7 @@ class SparseMap:
     def __init__(self, camera: StereoCamera, config: MappingConfig) -> None:
         self.camera, self.config = camera, config
         self.keyframes: list[Keyframe] = []
+        self.album = PatchAlbum()
         self._covisible: list[Ids] = []  # per keyframe, its covisible ones, most shared first
         self._n_shared: list[Ids] = []  # with each of them
         self._size = 0
@@ -225,8 +230,25 @@ class SparseMap:
         """
         doomed = ids[self.alive[ids]]
         self.alive[doomed] = False
+        self.album.forget(doomed)
         self._young = self._young[self.alive[self._young]]
         self._free = np.concatenate([self._free, doomed[self.n_keyframes[doomed] == 0]])
+
+    def keep_patches(self, patches: Patches) -> None:
+        """Keep how points look that have lasted for some keyframes by now.
+
+        What was kept before stays: it is nearer to what a point was at first.
+        """
+        ids = patches.point_ids
+        lasting = self.alive[ids] & (self.n_keyframes[ids] >= _LASTING) & ~self.album.has(ids)
+        patches = patches[lasting]
+        Ts = self._keyframe_Ts[self.first_keyframe[patches.point_ids]]
+        self.album.add(patches.moved(invert_T(Ts)))
+
+    def kept_patches(self, ids: Ids) -> Patches:
+        """The patches that are kept of some points, in the world as it is now."""
+        patches = self.album.of(ids)
+        return patches.moved(self._keyframe_Ts[self.first_keyframe[patches.point_ids]])
 
     # ------------------------------------------------------------- keyframes
 

@@ -1,47 +1,27 @@
-"""Patches: how tracked points looked when they were first seen, and how they should look by now.
+"""Patches: how points looked when they were first seen, and how they should look by now.
 
-A place that is aligned to the last frame carries that frame's error on, so that tracks drift as a
-random walk does; one that is aligned to its first sight does not. Owns the small pictures, and
-their warping to another view of the plane that each shows. Knows no map.
-
-Deviation: in the paper points are matched from frame to frame.
+Owns the small pictures, and their warping to another view of the plane that each shows. Lies below
+front-end and map, and knows neither; pictures are cut in `frontend.patch_cutting`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.frontend.sampling import disparity_slopes
-from pipelines.frontend.view import View
 from pipelines.geometry import invert_T
-from pipelines.observations import Tracks
 from pipelines.types import Array, Image, StereoCamera
 
 SIDE_PX = 21  # the window of the alignment, its gradients, and the fraction of the point's pixel
-_HALF = SIDE_PX // 2
-_MIN_GROWTH, _MAX_GROWTH = 0.85, 2.0  # sizes beyond which a patch is cut anew
-_TOO_FAR = 2.0  # times beyond these, a patch is of no use at all
+_MIN_GROWTH, _MAX_GROWTH = 0.85, 2.0  # sizes between which a patch shows its point as it is
+_TOO_FAR = 2.0  # times beyond these, it is of no use at all
 _PIXELS = np.stack(
     [g.ravel() for g in np.meshgrid(np.arange(SIDE_PX), np.arange(SIDE_PX))] + [np.ones(SIDE_PX**2)]
 ).astype(np.float32)  # (3, 441) homogeneous pixels of a patch
-
-
-@dataclass(frozen=True, slots=True)
-class Shot:
-    """A view that patches are cut from, with its T_world_camera (4, 4).
-
-    sigma_disparity_px: noise of its disparities.
-    """
-
-    camera: StereoCamera
-    view: View
-    T_world_camera: Array
-    sigma_disparity_px: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +55,16 @@ class Patches:
             np.empty((0, 4, 4)),
         )
 
+    def __getitem__(self, which: NDArray) -> Patches:
+        """The patches chosen by a boolean mask, or by an index array that keeps ids ascending."""
+        return Patches(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    @classmethod
+    def concatenate(cls, *parts: Patches) -> Patches:
+        """All parts, of which no two hold one point."""
+        arrays = [np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)]
+        return cls(*arrays)[np.argsort(arrays[0], kind="stable")]
+
     def rows(self, point_ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """(M,) row of each point's patch, -1 where there is none."""
         if len(self) == 0:
@@ -82,9 +72,9 @@ class Patches:
         at = np.minimum(np.searchsorted(self.point_ids, point_ids), len(self) - 1)
         return np.where(self.point_ids[at] == point_ids, at, -1)
 
-    def moved(self, C: Array) -> Patches:
-        """The same in a world that was corrected: p_new = C (4, 4) @ p_old."""
-        return replace(self, T_world_camera=C @ self.T_world_camera)
+    def moved(self, Cs: Array) -> Patches:
+        """The same in another world, or one corrected: p_new = C @ p_old, (4, 4) or (N, 4, 4)."""
+        return replace(self, T_world_camera=Cs @ self.T_world_camera)
 
     def homographies(
         self, camera: StereoCamera, rows: NDArray[np.int64], T_world_camera: Array
@@ -93,6 +83,11 @@ class Patches:
         K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
         T = invert_T(T_world_camera) @ self.T_world_camera[rows]
         return K @ (T[:, :3, :3] @ np.linalg.inv(K) + T[:, :3, 3:] @ self.plane[rows, None])
+
+    def are_like(self, rows: NDArray[np.int64], Hs: Array) -> NDArray[np.bool_]:
+        """(M,) which patches show their points about as large as after homographies."""
+        growth = _growth(Hs, self.uv_px[rows])
+        return (growth > _MIN_GROWTH) & (growth < _MAX_GROWTH)
 
     def are_of_use(self, rows: NDArray[np.int64], Hs: Array) -> NDArray[np.bool_]:
         """(M,) which patches can be warped by homographies, and still show anything then."""
@@ -137,52 +132,6 @@ class Patches:
         x, y = x.reshape(-1, SIDE_PX), y.reshape(-1, SIDE_PX)
         warped = cv2.remap(column, x, y, cv2.INTER_LINEAR)
         return warped.reshape(n, SIDE_PX, SIDE_PX)
-
-
-def renew_patches(old: Patches, shot: Shot, tracks: Tracks, depth_m: Array) -> Patches:
-    """Patches of the points that are tracked on: the old ones while they fit, else new ones.
-
-    tracks: N points as the shot sees them, depth_m (N,) away from its camera.
-    """
-    order = np.argsort(tracks.point_ids, kind="stable")
-    tracks, depth_m = tracks[order], depth_m[order]
-    rows = old.rows(tracks.point_ids)
-    fits = rows >= 0
-    Hs = old.homographies(shot.camera, rows[fits], shot.T_world_camera)
-    growth = _growth(Hs, old.uv_px[rows[fits]])
-    fits[fits] = (growth > _MIN_GROWTH) & (growth < _MAX_GROWTH)
-    new = _cut_patches(shot, tracks[~fits], depth_m[~fits])
-    both = np.concatenate([np.flatnonzero(fits), np.flatnonzero(~fits)]).argsort(kind="stable")
-
-    def join(kept: NDArray, fresh: NDArray) -> NDArray:
-        return np.concatenate([kept[rows[fits]], fresh])[both]
-
-    return Patches(
-        tracks.point_ids,
-        join(old.pixels, new.pixels),
-        join(old.corner_px, new.corner_px),
-        join(old.uv_px, new.uv_px),
-        join(old.plane, new.plane),
-        join(old.T_world_camera, new.T_world_camera),
-    )
-
-
-def _cut_patches(shot: Shot, tracks: Tracks, depth_m: Array) -> Patches:
-    view, bf, uv_px = shot.view, shot.camera.bf, tracks.uv_px
-    H, W = view.gray.shape
-    corner = np.floor(uv_px).astype(np.int64) - _HALF
-    x = np.clip(corner[:, :1] + np.arange(SIDE_PX), 0, W - 1)
-    y = np.clip(corner[:, 1:] + np.arange(SIDE_PX), 0, H - 1)
-    slopes = disparity_slopes(view.disparity_px, uv_px, shot.sigma_disparity_px)
-    at_origin = bf / depth_m - (slopes * uv_px).sum(axis=1)
-    return Patches(
-        tracks.point_ids,
-        view.gray[y[:, :, None], x[:, None, :]],
-        corner,
-        uv_px,
-        np.column_stack([slopes, at_origin]) / bf,
-        np.tile(shot.T_world_camera, (len(uv_px), 1, 1)),
-    )
 
 
 def _growth(Hs: Array, uv_px: Array) -> Array:

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from pipelines.frontend.alignment import align_patches
-from pipelines.frontend.patches import SIDE_PX, Patches, Shot, renew_patches
+from pipelines.frontend.patch_cutting import Shot, renew_patches
 from pipelines.frontend.view import View
 from pipelines.geometry import exp_se3, invert_T, project_stereo, transform_points
 from pipelines.observations import Tracks
+from pipelines.patches import SIDE_PX, Patches
 from pipelines.types import Features, StereoCamera
 
 W, H = 400, 300
