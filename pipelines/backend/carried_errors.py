@@ -17,6 +17,7 @@ from pipelines.types import Array
 
 _FAR = 8  # frames, over which the growth of errors is measured
 _MIN_SAMPLES = 200  # fewer pairs of sightings so far apart say nothing of it
+_MOST_SIGHTINGS = 60_000  # more tell it no better
 _SETTLING_ROUNDS = 3
 _LEAST_CARRIED = 0.05  # nothing at all would count as not followed
 
@@ -26,15 +27,16 @@ def learn_carried(problem: BatchProblem) -> BatchProblem:
 
     Where points are aligned to their first sight, errors are partly new in every frame; where flow
     or worn patches lead from frame to frame they walk. How much farther errors come apart over some
-    frames than over one tells, at the front-end's poses: both are a first-order Markov process.
+    frames than over one tells: both are a first-order Markov process. Each pose is moved to where
+    it fits its own frame first, or errors of poses would be taken for those of pixels.
     """
-    tracks = problem.tracks
-    far = np.arange(_FAR, len(tracks))
-    run = np.cumsum(~tracks.is_followed)
-    far = far[(run[far] == run[far - _FAR]) & (tracks.view[far] < problem.n_frames)]
+    long = _long_tracks(problem)
+    far = np.arange(_FAR, len(long.tracks))
+    run = np.cumsum(~long.tracks.is_followed)
+    far = far[run[far] == run[far - _FAR]]
     if len(far) < _MIN_SAMPLES:
         return problem
-    off = _off_at_best_poses(problem)
+    off = _off_at_best_poses(long)
     apart_px = [float(np.median(np.abs(off[far] - off[far - lag]))) for lag in (1, _FAR)]
     if apart_px[0] == 0.0:
         return problem  # nothing ever moves, nor errs
@@ -42,11 +44,24 @@ def learn_carried(problem: BatchProblem) -> BatchProblem:
     shares = np.linspace(_LEAST_CARRIED, 1.0, 200, endpoint=False)
     expected = np.sqrt((1.0 - shares**_FAR) / (1.0 - shares))
     carried = float(np.interp(growth, expected, shares, right=1.0))
+    tracks = problem.tracks
     static = tracks.is_followed & (tracks.view < problem.n_frames)
     # What is told of a step is of the difference of two errors
     sigma = tracks.sigma_uv_px * np.where(static, np.sqrt(0.5 * (1.0 + carried)), 1.0)
     learned = replace(tracks, carried=np.where(static, carried, tracks.carried), sigma_uv_px=sigma)
     return problem.with_tracks(learned, problem.sighting_rows)
+
+
+def _long_tracks(problem: BatchProblem) -> BatchProblem:
+    """The same problem with no more than some of the long static tracks."""
+    tracks = problem.tracks
+    long = (tracks.lengths > _FAR) & (tracks.view[tracks.starts] < problem.n_frames)
+    every = -(-int(tracks.lengths[long].sum()) // _MOST_SIGHTINGS)
+    chosen = np.flatnonzero(long)[:: max(every, 1)]
+    keep = np.zeros(tracks.n_tracks, bool)
+    keep[chosen] = True
+    kept = replace(problem, points_m=problem.points_m[keep])
+    return kept.with_tracks(tracks.of_tracks(keep), problem.sighting_rows[keep[tracks.track]])
 
 
 def _off_at_best_poses(problem: BatchProblem) -> Array:

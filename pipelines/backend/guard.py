@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipelines.backend.batch_problem import BatchProblem
 from pipelines.backend.held_out import HeldOut, held_out_errors
-from pipelines.backend.misfit import squared_misfits
+from pipelines.backend.misfit import object_misfits
 from pipelines.backend.point_elimination import settle_points
 from pipelines.geometry import invert_T, orthonormalise
 from pipelines.object_types import ObjectEstimates
@@ -118,8 +118,7 @@ def misfit_motions(
     view = before.tracks.view - before.n_frames
     on_object = view >= 0
     for problem, sign in ((before, -1.0), (after, 1.0)):
-        squares = squared_misfits(problem)[on_object]
-        growth += sign * np.bincount(view[on_object], squares, n)
+        growth += sign * np.bincount(view[on_object], object_misfits(problem), n)
     found: NDArray[np.bool_] = np.zeros(n, bool)
     told = _front_end_motions(before, after)
     for stretch in before.stretches:

@@ -1,6 +1,6 @@
 """How badly sightings fit a problem's poses, and what that says of their noise.
 
-Owns the squared errors that verdicts and weights are made of. Solves nothing.
+Owns the squared errors of objects that verdicts and weights are made of. Solves nothing.
 """
 
 from __future__ import annotations
@@ -17,12 +17,17 @@ _NOISY = 2.0  # times the median misfit of all objects, from which on a view of 
 _MAX_NOISE_FACTOR = 4.0  # of its standard deviations then
 
 
-def squared_misfits(problem: BatchProblem) -> Array:
-    """(N,) squared whitened residuals under Huber's kernel, with points settled for the poses."""
+def object_misfits(problem: BatchProblem) -> Array:
+    """(M,) squared whitened residuals under Huber's kernel of all sightings of objects, in order.
+
+    With points settled for the poses.
+    """
+    on_object = problem.tracks.view[problem.tracks.starts] >= problem.n_frames
+    tracks = problem.tracks.of_tracks(on_object)
     views = problem.views(problem.Ts_world_camera, problem.Ts_world_object)
-    points = settle_points(problem.camera, problem.tracks, views, problem.points_m)
-    every = np.ones(len(problem.tracks), bool)
-    seen = evaluate(problem.camera, problem.tracks, views, points, every, every)
+    points = settle_points(problem.camera, tracks, views, problem.points_m[on_object])
+    every = np.ones(len(tracks), bool)
+    seen = evaluate(problem.camera, tracks, views, points, every, every)
     w_uv, w_disparity = seen.weight_uv, seen.weight_disparity
     squares = (seen.uv**2).sum(1) * w_uv * (2.0 - w_uv)
     squares += seen.disparity**2 * w_disparity * (2.0 - w_disparity)
@@ -40,9 +45,9 @@ def allow_for_noisy_views(problem: BatchProblem) -> BatchProblem:
     on_object = view >= 0
     if not on_object.any():
         return problem
-    squares = squared_misfits(problem)
-    share = _medians(squares[on_object], view[on_object], len(problem.Ts_world_object))
-    share /= max(float(np.median(squares[on_object])), 1e-12)
+    squares = object_misfits(problem)
+    share = _medians(squares, view[on_object], len(problem.Ts_world_object))
+    share /= max(float(np.median(squares)), 1e-12)
     factor = np.where(share > _NOISY, np.minimum(np.sqrt(share), _MAX_NOISE_FACTOR), 1.0)
     by_sighting = np.ones(len(problem.tracks))
     by_sighting[on_object] = factor[view[on_object]]

@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.backend import global_batch
 from pipelines.backend.batch_problem import build_problem
-from pipelines.backend.misfit import allow_for_noisy_views, squared_misfits
+from pipelines.backend.misfit import allow_for_noisy_views, object_misfits
 from pipelines.config import BatchConfig
 from pipelines.geometry import invert_T
 from pipelines.object_types import ObjectEstimates
@@ -60,4 +60,12 @@ def test_a_dragged_view_drags_the_motion_less(make_drive, stereo, monkeypatch):
 def test_without_objects_nothing_is_weighed(make_drive, stereo):
     problem = build_problem(stereo, make_drive(0, jitter=0.0).log, ObjectEstimates.empty())
     assert allow_for_noisy_views(problem) is problem
-    assert np.median(squared_misfits(problem)) == pytest.approx(1.5, abs=1.5)
+    assert len(object_misfits(problem)) == 0
+
+
+def test_misfits_of_objects_at_the_truth_are_as_the_noise(make_drive, stereo):
+    drive = make_drive(0, jitter=0.0)
+    problem = build_problem(stereo, drive.log, drive.objects)
+    squares = object_misfits(problem)
+    assert len(squares) == (problem.tracks.view >= problem.n_frames).sum()
+    assert np.median(squares) == pytest.approx(1.5, abs=1.0)
