@@ -224,16 +224,22 @@ def weigh(tracks: PointTracks) -> PointTracks:
     begins = np.zeros(len(tracks), bool)
     begins[tracks.starts] = True
     group = 2 * tracks.view + (~tracks.is_followed & ~begins)
-    cell = np.floor(tracks.uv_px / _CORRELATION_PX).astype(np.int64)
-    cell -= cell.min(0, initial=0)
-    key = (group * (cell[:, 1].max(initial=0) + 1) + cell[:, 1]) * (
-        cell[:, 0].max(initial=0) + 1
-    ) + cell[:, 0]
-    _, first = np.unique(key, return_index=True)
+    first = witnesses(group, tracks.uv_px)
     n_cells = np.bincount(group[first], minlength=2 * tracks.n_views)
     n_points = np.bincount(group, minlength=2 * tracks.n_views)
     factor = np.sqrt(n_points / np.maximum(n_cells, 1))[group]
     return tracks.with_sigmas(tracks.sigma_uv_px * factor, tracks.sigma_disparity_px)
+
+
+def witnesses(group: Index, uv_px: Array) -> Index:
+    """Rows, one of each patch of the image in each group (N,), in which errors of pixels are alike.
+
+    uv_px: (N, 2). So many are witnesses, however many sightings there are.
+    """
+    cell = np.floor(uv_px / _CORRELATION_PX).astype(np.int64)
+    cell -= cell.min(0, initial=0)
+    wide, high = (int(n) + 1 for n in cell.max(0, initial=0))
+    return np.unique((group * high + cell[:, 1]) * wide + cell[:, 0], return_index=True)[1]
 
 
 def choose_longest(

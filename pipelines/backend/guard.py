@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.backend.batch_problem import BatchProblem
+from pipelines.backend.batch_problem import BatchProblem, witnesses
 from pipelines.backend.held_out import HeldOut, held_out_errors
 from pipelines.backend.misfit import object_misfits
 from pipelines.backend.point_elimination import settle_points
@@ -94,12 +94,18 @@ def judge(
 
 
 def _n_numbers(problem: BatchProblem, held: HeldOut, views: NDArray[np.bool_]) -> int:
-    """How many numbers the front-end has measured in some views (V,), those held out among them."""
-    n = 0
-    for seen in (problem.tracks, held):
-        own = views[seen.view]
-        n += int((2 + np.isfinite(seen.disparity_px[own])).sum())
-    return n
+    """How many numbers the front-end has measured in some views (V,), those held out among them.
+
+    Pixels of one patch err alike, and count as one: a pose fits so much more of their errors.
+    """
+    seen = (problem.tracks, held)
+    view = np.concatenate([s.view for s in seen])
+    uv_px, disparity_px = (
+        np.concatenate([getattr(s, name) for s in seen]) for name in ("uv_px", "disparity_px")
+    )
+    own = views[view]
+    n_patches = len(witnesses(view[own], uv_px[own]))
+    return 2 * n_patches + int(np.isfinite(disparity_px[own]).sum())
 
 
 def misfit_motions(
