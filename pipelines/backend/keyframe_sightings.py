@@ -28,8 +28,8 @@ class KeyframeSightings:
     keyframes: (K,) rows in the map, ascending. frame_index: (K,). Ts_world_camera: (K, 4, 4).
     view: (M,) rows of these. point_ids: (M,), of points that are alive. uv_px: (M, 2).
     disparity_px: (M,) with the offset as it is known by now, NaN where unknown. sigma_uv_px: (M,)
-    of a step from the frame before. sigma_disparity_px: of all. sigma_found_px: (M,) of a
-    place where a point was not followed to, but found again.
+    of a step from the frame before. sigma_disparity_px: of all. sigma_found_px: (M,) of
+    the place, where a point was not followed to it but found again.
     """
 
     camera: StereoCamera

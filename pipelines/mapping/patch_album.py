@@ -1,4 +1,4 @@
-"""How lasting points looked that are out of sight by now, to be known again where a path returns.
+"""How lasting points looked at first, to be known again where a path returns.
 
 Owns the storage of these pictures. Each hangs on a keyframe, and so follows whatever moves the map.
 Who is kept is for `sparse_map` to say, who is looked for for `frontend.map_search`.

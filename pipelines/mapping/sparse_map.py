@@ -53,9 +53,8 @@ _COLUMNS: dict[str, tuple[tuple[int, ...], type]] = {
 class SparseMap:
     """Points and keyframes of the static world.
 
-    album: how points looked that are out of sight. Attributes named in `_COLUMNS` are arrays of
-    capacity N; a point's id is its row. Rows of points that died before any keyframe saw them are
-    used again.
+    album: how lasting points looked at first. Attributes named in `_COLUMNS` are arrays of capacity
+    N; a point's id is its row, and is used again where no keyframe saw a point before it died.
     """
 
     position_m: Array
