@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _LAMBDA, _LEAST_LAMBDA, _MOST_LAMBDA = 1e-4, 1e-6, 1e6
 _RELATIVE_STOP, _ABSOLUTE_STOP = 1e-4, 1e-3  # of the cost's fall in one step
+_ROUGH_STOP = 0.05  # of the same, where outliers are all that is asked
 _ZERO = np.zeros((6, 6)), np.zeros(6)
 
 Progress = Callable[[int, int], None]
@@ -54,8 +55,14 @@ def solve(
     keep_disparity: NDArray[np.bool_],
     max_steps: int,
     after_step: Callable[[], None] = lambda: None,
+    *,
+    is_rough: bool = False,
 ) -> Solution:
-    """The problem at its optimum. graph: factors between poses. keep_*: (N,) as of `evaluate`."""
+    """The problem at its optimum. graph: factors between poses. keep_*: (N,) as of `evaluate`.
+
+    is_rough: near enough to it to tell outliers.
+    """
+    least_fall = _ROUGH_STOP if is_rough else _RELATIVE_STOP
     values = to_values(problem)
     ordering = make_ordering(problem)
 
@@ -91,7 +98,7 @@ def solve(
             continue
         fall, damping = cost - cost_new, max(damping / 10.0, _LEAST_LAMBDA)
         problem, values, residuals, cost = moved, moved_values, residuals_new, cost_new
-        if fall < max(_RELATIVE_STOP * cost, _ABSOLUTE_STOP):
+        if fall < max(least_fall * cost, _ABSOLUTE_STOP):
             break
     return Solution(problem, residuals, before, cost, steps)
 

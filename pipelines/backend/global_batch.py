@@ -110,10 +110,13 @@ def run_global_batch(
     solution, cost_before = None, 0.0
     for number in range(config.rounds):
         at = problem if solution is None else solution.problem
-        solution = solve(at, graph, keep_uv, keep_disparity, config.max_steps, step)
+        is_last = number + 1 == config.rounds
+        solution = solve(
+            at, graph, keep_uv, keep_disparity, config.max_steps, step, is_rough=not is_last
+        )
         if number == 0:
             cost_before = solution.cost_before
-        if number + 1 < config.rounds:
+        if not is_last:
             keep_uv, keep_disparity = inliers(solution.residuals)
         done = (number + 1) * config.max_steps
     assert solution is not None

@@ -75,8 +75,8 @@ def test_what_gets_worse_is_refused(make_drive, stereo, monkeypatch, what):
     drive = make_drive(2, jitter=0.001)
     right = global_batch.solve
 
-    def spoilt(*arguments):
-        solution = right(*arguments)
+    def spoilt(*arguments, **keywords):
+        solution = right(*arguments, **keywords)
         problem, rng = solution.problem, np.random.default_rng(0)
         X, L = problem.Ts_world_camera, problem.Ts_world_object
         wrong = exp_se3(rng.normal(size=(len(X), 6)) * np.repeat([0.005, 0.05], 3))
@@ -128,8 +128,8 @@ def test_a_single_motion_that_gets_worse_stays_the_front_ends(make_drive, stereo
     drive = make_drive(3)
     right = global_batch.solve
 
-    def spoilt(*arguments):
-        solution = right(*arguments)
+    def spoilt(*arguments, **keywords):
+        solution = right(*arguments, **keywords)
         L = solution.problem.Ts_world_object.copy()
         L[6, 0, 3] += 1.0
         problem = solution.problem
@@ -229,3 +229,21 @@ def test_lost_frames_follow_and_too_little_is_left_alone(make_drive, stereo):
     step = invert_T(log[4].T_world_camera) @ lost.T_world_camera
     np.testing.assert_allclose(invert_T(Ts[4]) @ Ts[5], step, atol=1e-9)
     assert run_global_batch(stereo, log[:2], ObjectEstimates.empty(), CONFIG) is None
+
+
+def test_a_rough_first_round_leads_to_the_same_optimum(make_drive, stereo, monkeypatch):
+    drive, right, rough = make_drive(3), global_batch.solve, []
+
+    def thorough(*args, is_rough=False):
+        rough.append(is_rough)
+        return right(*args)
+
+    config = BatchConfig(held_out_share=0.05, max_steps=20)
+    found = run_global_batch(stereo, drive.log, drive.objects, config)
+    monkeypatch.setattr(global_batch, "solve", thorough)
+    best = run_global_batch(stereo, drive.log, drive.objects, config)
+    assert rough == [True, False]
+    apart = invert_T(found.after.Ts_world_camera) @ best.after.Ts_world_camera
+    error = invert_T(best.after.Ts_world_camera) @ drive.Ts_true
+    far, off = (np.linalg.norm(T[:, :3, 3], axis=1) for T in (apart, error))
+    assert far.max() < 0.05 * off.max()
