@@ -36,7 +36,7 @@ MAP_EVERY_S = 2.0
 PICTURE_EVERY_S = 0.25  # to draw each one would take the run half a core
 NICE = 10  # what the process of the pictures lets go before it
 MAX_LIVE_POINTS = 60_000  # as the map is sent anew each time
-TILTED = np.cos(np.radians(2.0))  # what is known of up changes; by less, nothing is turned
+TILTED = np.cos(np.radians(2.0))  # by less, nothing is turned while the run goes on
 logger = logging.getLogger("dyob.viz")
 
 
@@ -156,7 +156,7 @@ class LiveViewer:
                     self._show_map()
             except Exception:  # whatever goes wrong in the view, the run goes on
                 logger.exception("the browser viewer has missed something")
-        self._show_map()
+        self._show_map(is_last=True)
 
     def _take(self) -> list[_Seen | _Moved | _Drawn] | None:
         """What has come, nothing where a picture is due before that; None when all is shown."""
@@ -214,13 +214,14 @@ class LiveViewer:
         self._is_drawing = True
         drawing.add_done_callback(take)
 
-    def _show_map(self) -> None:
+    def _show_map(self, *, is_last: bool = False) -> None:
+        """Send the map where it has changed; the last one goes by all that is known of up."""
         if self._have_moved:
             self._server.tell_all_frames([_record(frame) for frame in self._frames.list])
-        if self._have_moved or self._map.changed:
+        if is_last or self._have_moved or self._map.changed:
             Ts = self._frames.Ts_world_camera
             axes = level_axes(Ts)
-            if axes[0] @ self._axes[0] < TILTED:
+            if is_last or axes[0] @ self._axes[0] < TILTED:
                 self._axes = axes
             points, colors = self._map.cloud(Ts)
             if len(points):

@@ -19,6 +19,7 @@ from pipelines.types import Frame, FrameResult, MotionHypothesis, TrackingStatus
 from viz.browser import export_scene
 from viz.browser.live import LiveViewer
 from viz.browser.recorded import RecordedServer
+from viz.scene import level_axes
 
 SIZE = {"width": 900, "height": 560}
 WAIT_S = 40.0
@@ -289,8 +290,9 @@ def test_a_live_run_is_seen_and_stays_when_it_is_over(browser, objects, tmp_path
     assert "Traceback" not in said and "never retrieved" not in said
 
 
-def test_a_live_view_goes_by_the_map_that_comes(browser, tmp_path):
+def test_a_live_view_goes_by_the_map_that_comes(browser, tmp_path, monkeypatch):
     """A camera in a hand looks down at things close by: what is level shows as it turns about."""
+    monkeypatch.setattr("viz.browser.live.MAP_EVERY_S", 0.0)
     urls: list[str] = []
     viewer = LiveViewer(announce=urls.append)
     camera = SimpleNamespace(cx=160, cy=60, fx=200, fy=200, width=320, height=120)
@@ -298,8 +300,8 @@ def test_a_live_view_goes_by_the_map_that_comes(browser, tmp_path):
     up = np.array([0.0, -np.cos(0.5), -np.sin(0.5)])  # the first camera looks down by half a rad
     points = np.random.default_rng(0).uniform([-1, -0.5, 0.8], [1, 0.5, 2], (300, 3))
     visit = Visit(browser, urls[0])
-    for k in range(20):
-        T = exp_se3(np.concatenate([-up * 0.05 * k, [0, 0, 0]]))
+    Ts = [exp_se3(np.concatenate([-up * 0.05 * k, [0, 0, 0]])) for k in range(20)]
+    for k, T in enumerate(Ts):
         n = np.ones(len(points))
         in_camera = transform_points(np.linalg.inv(T), points)
         ids = np.arange(len(points))
@@ -312,11 +314,13 @@ def test_a_live_view_goes_by_the_map_that_comes(browser, tmp_path):
             observations=seen,
         )  # fmt: skip
         viewer.frame(Frame(k, 0.1 * k, np.zeros((120, 320, 3), np.uint8)), result)
-    visit.until("dyob.length === 20 && dyob.frame === 19")
+        visit.until(f"dyob.length === {k + 1} && dyob.frame === {k}")  # each with its own map
     viewer.finish()
     visit.until("dyob.player.isOver")
     assert visit.ask("document.getElementById('points').textContent") == "300 points"
-    np.testing.assert_allclose(visit.ask("dyob.player.world.axes.up.toArray()"), up, atol=0.06)
+    shown = visit.ask("dyob.player.world.axes.up.toArray()")
+    np.testing.assert_allclose(shown, level_axes(np.array(Ts))[0], atol=1e-5)
+    np.testing.assert_allclose(shown, up, atol=0.06)
     away = np.linalg.norm(visit.ask("dyob.player.viewer.camera.position.toArray()"))
     assert 0.5 < away < 4  # the page opened before anything told that this is no street
     assert visit.complaints == []
