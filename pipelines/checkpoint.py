@@ -134,7 +134,7 @@ class Checkpoints:
         head = {"version": VERSION, "origin": self._origin, "files": self._files}
         text = np.frombuffer(json.dumps(head).encode(), np.uint8)
         with replacing(self.folder / STATE) as path:
-            np.savez(path, **{_HEAD: text, **changing.arrays(root)})  # type: ignore[arg-type]
+            changing.save(path, root, **{_HEAD: text})
         for path in self._stores():
             if path.name not in self._files:
                 path.unlink(missing_ok=True)

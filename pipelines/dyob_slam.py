@@ -47,6 +47,7 @@ from pipelines.objects.frame import ObjectFrame
 from pipelines.objects.landmarks import StandingObjects
 from pipelines.objects.tracking import ObjectTracker
 from pipelines.observations import Tracks
+from pipelines.paged_arrays import PagedArrays
 from pipelines.perception import FILES, DenseFlow, Segmentation
 from pipelines.types import (
     Array,
@@ -80,13 +81,14 @@ class DyObSlam:
         config: Config | None = None,
         known_map: SparseMap | None = None,
         localize: bool = False,
+        arrays: PagedArrays | None = None,
     ) -> None:
         """A system that has seen nothing yet.
 
         camera: of all frames to come, as `sequence.camera`. config: all settings; the default ones
         where None. known_map: of an earlier run, whose world holds; it is continued, and so it
         changes. Every frame is LOST then until one is recognised in it. localize: the map is only
-        read.
+        read. arrays: where the map is kept; in memory where None.
         Raises ValueError for localize without a map, FormatError for a damaged vocabulary.
         """
         if localize and known_map is None:
@@ -97,6 +99,8 @@ class DyObSlam:
         if known_map is not None and not localize:
             known_map.detach_offset()
         self.localize = localize
+        self.arrays = arrays or PagedArrays()
+        self.map.move_into(self.arrays)
         self.places = SeenPlaces(self.config.places)
         self.places.add_map(self.map)
         self._orb = OrbExtractor(self.config.orb)
@@ -201,7 +205,7 @@ class DyObSlam:
         """By name, what is the same in another system of this camera and these settings."""
         parts = {f"config.{f.name}": getattr(self.config, f.name) for f in fields(self.config)}
         parts |= {"config": self.config, "camera": self.camera}
-        return parts | {"orb": self._orb, "worker": self._backend.worker}
+        return parts | {"orb": self._orb, "worker": self._backend.worker, "arrays": self.arrays}
 
     def state(self) -> dict[str, Any]:
         """All that the next frames depend on besides `fixed_parts`, for `restore`; not a copy.
@@ -217,6 +221,7 @@ class DyObSlam:
         vars(self).update(state["system"])
         self._segmentation.__setstate__(state["segmentation"])
         self._flow.__setstate__(state["flow"])
+        self.map.move_into(self.arrays)
 
     def static_map(self) -> StaticMap:
         """The sparse static map as it stands, copied."""

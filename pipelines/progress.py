@@ -76,8 +76,8 @@ def resume_progress(
     recorder = None
     if state["recorder"] is not None:
         recorder = ObservationRecorder.go_on(folder / names.OBSERVATIONS, *state["recorder"])
-    done = state["results"], state["n_done"], state["skipped"]
-    return Progress(*done, recorder, last, state["earlier"])
+    results = [slam.arrays.keep(result) for result in state["results"]]
+    return Progress(results, state["n_done"], state["skipped"], recorder, last, state["earlier"])
 
 
 def _read_again(folder: Path, sequence: Sequence, index: int) -> Frame:

@@ -38,9 +38,11 @@ from pipelines.io.result import (
 )
 from pipelines.lasting_map import LastingMap, note_end, note_start
 from pipelines.object_map import write_object_map
+from pipelines.paged_arrays import PagedArrays
 from pipelines.progress import Progress, resume_progress
 from pipelines.types import Array, Frame, FrameResult
 
+_FRAMES_IN_MEMORY = 50  # before what they touched of the map is let go
 RESULTS = "results"  # folder that result folders go to, below the working folder
 _log = logging.getLogger("dyob.run")
 
@@ -118,7 +120,8 @@ def run(
     if not resume:
         folder = create_result_folder(RESULTS, sequence.name) if output is None else Path(output)
         clear_result_folder(folder)
-    slam = DyObSlam(sequence.camera, config, known, lasting_map.localize)
+    arrays = PagedArrays(folder)
+    slam = DyObSlam(sequence.camera, config, known, lasting_map.localize, arrays)
     origin = run_origin(sequence, config, indices, lasting_map.origin())
     if resume:
         progress = resume_progress(folder, sequence, slam, origin)
@@ -214,6 +217,8 @@ class _Work:
                 is_last = progress.n_done == len(self.indices)
                 if is_last or progress.n_done % max(self.checkpoint_every, 1) == 0:
                     self._keep()
+                if progress.n_done % _FRAMES_IN_MEMORY == 0:
+                    self.slam.arrays.let_go()
 
     def _process(self, prepared: PreparedFrame, begin: float) -> float:
         """One frame; begin, and what is returned: times of two results, one after the other."""
@@ -224,7 +229,7 @@ class _Work:
         result.timings_ms["wall"] = 1e3 * (end - begin)
         if progress.recorder is not None and result.observations is not None:
             progress.recorder.add(result.observations)
-        progress.results.append(result.summary())
+        progress.results.append(self.slam.arrays.keep(result.summary()))
         progress.n_done += 1
         progress.last, progress.in_frame = prepared.frame, False
         _log_frame(result)

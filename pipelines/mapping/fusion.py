@@ -27,12 +27,8 @@ def fuse_points(sparse_map: SparseMap, pairs: Ids) -> Ids:
     kept, gone = pairs.T
     for index, keyframe in enumerate(sparse_map.keyframes):
         tracks = rename_points(keyframe.tracks, pairs)
-        if tracks is keyframe.tracks:
-            continue
-        joined = np.setdiff1d(tracks.point_ids, keyframe.tracks.point_ids)
-        sparse_map.n_keyframes[joined] += 1
-        sparse_map.keyframes[index] = replace(keyframe, tracks=tracks)
-        sparse_map.tie_to_others(index, joined)
+        if tracks is not keyframe.tracks:
+            sparse_map.replace_tracks(index, tracks)
     for name in ("n_found", "n_visible"):
         column = getattr(sparse_map, name)
         column[kept] += column[gone]

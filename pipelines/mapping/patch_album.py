@@ -11,6 +11,7 @@ from dataclasses import fields
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.paged_arrays import PagedArrays
 from pipelines.patches import Patches
 
 Ids = NDArray[np.int64]
@@ -25,6 +26,7 @@ class PatchAlbum:
         self._slot: Ids = np.empty(0, np.int64)  # by the point's id, -1 where there is no patch
         self._free: Ids = np.empty(0, np.int64)  # slots of patches that were forgotten
         self._n = 0  # slots that were ever used
+        self._arrays = PagedArrays()
         self._columns: dict[str, NDArray] = {
             f.name: getattr(Patches.empty(), f.name) for f in fields(Patches)
         }
@@ -47,15 +49,15 @@ class PatchAlbum:
         capacity = len(self._columns["point_ids"])
         if self._n > capacity:
             grown = max(2 * capacity, self._n, _FIRST_CAPACITY)
-            for name, old in self._columns.items():
-                self._columns[name] = np.zeros((grown, *old.shape[1:]), old.dtype)
-                self._columns[name][:capacity] = old
+            for name, column in self._columns.items():
+                self._columns[name] = self._arrays.grown(column, grown)
         for name, column in self._columns.items():
             column[slots] = getattr(patches, name)
         last = int(patches.point_ids.max())
         if last >= len(self._slot):
-            more = np.full(max(last + 1, 2 * len(self._slot)) - len(self._slot), -1)
-            self._slot = np.concatenate([self._slot, more])
+            n = len(self._slot)
+            self._slot = self._arrays.grown(self._slot, max(last + 1, 2 * n))
+            self._slot[n:] = -1
         self._slot[patches.point_ids] = slots
 
     def of(self, point_ids: Ids) -> Patches:
@@ -70,6 +72,13 @@ class PatchAlbum:
         if len(gone):
             self._free = np.concatenate([self._free, self._slot[gone]])
             self._slot[gone] = -1
+
+    def move_into(self, arrays: PagedArrays) -> None:
+        """Keep all patches in such arrays from now on."""
+        self._arrays = arrays
+        self._slot = arrays.grown(self._slot, len(self._slot))
+        for name, column in self._columns.items():
+            self._columns[name] = arrays.grown(column, len(column))
 
     def _slots(self, point_ids: Ids) -> Ids:
         slots = np.full(len(point_ids), -1)

@@ -24,6 +24,7 @@ from pipelines.geometry import (
 from pipelines.mapping.keyframe import Keyframe
 from pipelines.mapping.patch_album import PatchAlbum
 from pipelines.observations import StereoObservations, Tracks
+from pipelines.paged_arrays import PagedArrays
 from pipelines.patches import Patches
 from pipelines.types import Array, StaticMap, StereoCamera, check_shape
 
@@ -73,6 +74,7 @@ class SparseMap:
         self.camera, self.config = camera, config
         self.keyframes: list[Keyframe] = []
         self.album = PatchAlbum()
+        self._arrays = PagedArrays()
         self._covisible: list[Ids] = []  # per keyframe, its covisible ones, most shared first
         self._n_shared: list[Ids] = []  # with each of them
         self._size = 0
@@ -141,6 +143,15 @@ class SparseMap:
         """Per keyframe, the covisible ones, most shared first, and how many points each shares."""
         return list(zip(self._covisible, self._n_shared, strict=True))
 
+    def move_into(self, arrays: PagedArrays) -> None:
+        """Keep all of it in such arrays from now on."""
+        self._arrays = arrays
+        for name in _COLUMNS:
+            column = getattr(self, name)
+            setattr(self, name, arrays.grown(column, len(column)))
+        self.keyframes = [arrays.keep(keyframe) for keyframe in self.keyframes]
+        self.album.move_into(arrays)
+
     # ---------------------------------------------------------------- points
 
     def add_points(
@@ -178,10 +189,7 @@ class SparseMap:
         if self._size + fresh > capacity:
             grown = max(2 * capacity, self._size + fresh)
             for name in _COLUMNS:
-                old = getattr(self, name)
-                new = np.zeros((grown, *old.shape[1:]), old.dtype)
-                new[: self._size] = old[: self._size]
-                setattr(self, name, new)
+                setattr(self, name, self._arrays.grown(getattr(self, name), grown))
         ids = np.concatenate([reused, np.arange(self._size, self._size + fresh)])
         self._size += fresh
         return ids
@@ -260,7 +268,7 @@ class SparseMap:
         self._n_shared.append(np.empty(0, np.int64))
         self.first_keyframe[new] = index
         self.n_keyframes[ids] += 1
-        self.keyframes.append(keyframe)
+        self.keyframes.append(self._arrays.keep(keyframe))
         self._keyframe_Ts = np.concatenate([self._keyframe_Ts, keyframe.T_world_camera[None]])
         self._tie(index, others)
 
@@ -269,15 +277,15 @@ class SparseMap:
         keyframe = self.keyframes[index]
         ids = tracks.point_ids
         tracks = tracks[self.alive[ids] & ~np.isin(ids, keyframe.tracks.point_ids)]
-        self.n_keyframes[tracks.point_ids] += 1
-        self.keyframes[index] = replace(
-            keyframe, tracks=Tracks.concatenate(keyframe.tracks, tracks)
-        )
-        self.tie_to_others(index, tracks.point_ids)
+        self.replace_tracks(index, Tracks.concatenate(keyframe.tracks, tracks))
 
-    def tie_to_others(self, index: int, ids: Ids) -> None:
-        """Note who has become covisible with a keyframe, as it now sees these points as well."""
-        others = self.local_keyframes(ids, self.keyframes[index].T_world_camera)
+    def replace_tracks(self, index: int, tracks: Tracks) -> None:
+        """Give a keyframe other tracks; who sees the same as those that are new is told."""
+        keyframe = self.keyframes[index]
+        joined = np.setdiff1d(tracks.point_ids, keyframe.tracks.point_ids)
+        self.n_keyframes[joined] += 1
+        self.keyframes[index] = replace(keyframe, tracks=self._arrays.keep(tracks))
+        others = self.local_keyframes(joined, keyframe.T_world_camera)
         self._tie(index, np.setdiff1d(others, np.append(self._covisible[index], index)))
 
     def _tie(self, index: int, others: Ids) -> None:

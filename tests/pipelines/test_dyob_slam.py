@@ -14,6 +14,7 @@ from pipelines.datasets import open_sequence
 from pipelines.datasets.sequence import Sequence
 from pipelines.dyob_slam import DyObSlam
 from pipelines.errors import FrameError
+from pipelines.paged_arrays import PagedArrays
 from pipelines.types import (
     Frame,
     FrameResult,
@@ -42,6 +43,17 @@ def test_exact_street_is_tracked_to_fractions_of_a_millimetre(street, golden) ->
     assert 1e-5 < found["rpe_rot_rmse_deg"] < 4e-3
     assert 1e-5 < found["ate_rmse_m"] < 2e-3
     assert 0.999 < found["step_length_ratio"] < 1.001
+
+
+def test_a_map_on_the_disk_is_the_same_map(street, golden, tmp_path) -> None:
+    slam = DyObSlam(street.camera, arrays=PagedArrays(tmp_path))
+    for k, before in enumerate(golden):
+        result = slam.process(street.read(k))
+        slam.arrays.let_go()
+        np.testing.assert_array_equal(result.T_world_camera, before.T_world_camera)
+        np.testing.assert_array_equal(result.keypoints_px, before.keypoints_px)
+        np.testing.assert_array_equal(result.objects.centers_m, before.objects.centers_m)
+    slam.close()
 
 
 def test_degraded_street_is_tracked_to_a_centimetre(render_cache) -> None:
