@@ -47,7 +47,11 @@ class PagedArrays:
         try:
             content = _map_file(self.folder, n_bytes)
         except OSError as error:
-            _log.warning("%s: the map stays in memory, as %s", self.folder, error)
+            _log.warning(
+                "%s: expected room for the map, found '%s'; from now on it grows in memory",
+                self.folder,
+                error.strerror or error,
+            )
             self.folder = None
             return np.zeros(shape, dtype)
         self._maps.add(content)

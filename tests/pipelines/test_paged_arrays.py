@@ -116,7 +116,7 @@ def test_a_disk_that_refuses_costs_a_sentence(tmp_path: Path, monkeypatch, caplo
     np.testing.assert_array_equal(later.uv_px, tracks(10).uv_px)
     assert early.tolist() == [0, 1, 2, 3, 4]
     assert len(caplog.records) == 1
-    assert "stays in memory" in caplog.text and "No space left" in caplog.text
+    assert "grows in memory" in caplog.text and "No space left" in caplog.text
 
 
 def test_a_map_that_grows_takes_little_memory(tmp_path: Path) -> None:
