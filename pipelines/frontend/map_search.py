@@ -28,9 +28,9 @@ from pipelines.types import Array, Image
 _TAKEN_PX = 3.0  # a feature this near a tracked point is that point
 _NEAR_PX = 3.0  # alignment may move a place this far
 _RECENT = 10  # keyframes; what came to sight in these was lost for a reason
-_MOST = 300  # points that are looked for by their looks, those found most often first
-_HALF = 8  # of the window whose likeness is asked
-_MIN_LIKENESS = 0.8  # correlation of a patch with what is there
+_MOST = 600  # points that are looked for by their looks, those found most often first
+_HALF = 8  # of the window that is compared
+_MAX_LEEWAY_PX = 1.0  # of what is found; errors are about a third of it
 _OFFSETS = np.arange(-_HALF, _HALF + 1, dtype=np.float32)
 
 
@@ -126,23 +126,31 @@ def _align_to_looks(
         own = use[part]
         sure = np.ones(len(own), bool)
         placed, found = align_patches(sheet, view.gray, places, start[own], _NEAR_PX, sure)
-        found &= _likeness(_windows(sheet, places), _windows(view.gray, placed)) > _MIN_LIKENESS
+        found &= _leeway_px(_windows(sheet, places), _windows(view.gray, placed)) < _MAX_LEEWAY_PX
         uv[own[found]], alike[own[found]] = placed[found], True
     return uv, alike
 
 
 def _windows(gray: Image, uv_px: Array) -> Array:
-    """(N, 289) grey values around pixels (N, 2)."""
+    """(N, 17, 17) grey values around pixels (N, 2)."""
     x = uv_px[:, 0, None, None].astype(np.float32) + _OFFSETS
     y = uv_px[:, 1, None, None].astype(np.float32) + _OFFSETS[:, None]
     x, y = (np.broadcast_to(a, (len(uv_px), len(_OFFSETS), len(_OFFSETS))) for a in (x, y))
     flat = (len(uv_px) * len(_OFFSETS), len(_OFFSETS))
     values = cv2.remap(gray, x.reshape(flat), y.reshape(flat), cv2.INTER_LINEAR)
-    return values.reshape(len(uv_px), -1).astype(np.float32)
+    return values.reshape(x.shape).astype(np.float32)
 
 
-def _likeness(a: Array, b: Array) -> Array:
-    """(N,) correlation of windows (N, M) and (N, M)."""
-    a, b = a - a.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
-    size = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    return (a * b).sum(axis=1) / np.maximum(size, 1e-6)
+def _leeway_px(a: Array, b: Array) -> Array:
+    """(N,) how far windows a (N, H, W) could be shifted before they are less like b than they are.
+
+    What is left between the two, but for brightness and contrast, over the weakest gradient: little
+    where they are alike and where the window shows structure across every direction.
+    """
+    dy, dx = np.gradient(a, axis=(1, 2))
+    xx, xy, yy = (np.mean(p * q, axis=(1, 2)) for p, q in ((dx, dx), (dx, dy), (dy, dy)))
+    weakest = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
+    a, b = (w - w.mean(axis=(1, 2), keepdims=True) for w in (a, b))
+    aa, ab, bb = (np.mean(p * q, axis=(1, 2)) for p, q in ((a, a), (a, b), (b, b)))
+    left = aa - np.maximum(ab, 0.0) ** 2 / np.maximum(bb, 1e-6)
+    return np.sqrt(np.maximum(left, 0.0) / np.maximum(weakest, 1e-6))

@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from pipelines.config import DepthConfig, MappingConfig, TrackingConfig
 from pipelines.frontend import map_search
+from pipelines.frontend.alignment import align_patches
 from pipelines.frontend.map_search import search_local_map
 from pipelines.frontend.sensor import Sensor
 from pipelines.geometry import backproject, exp_se3
@@ -70,6 +72,42 @@ def test_what_something_hides_is_not_found():
     again = np.isin(floor.ids, found.tracks.point_ids)
     assert hidden.sum() > 20 and again[hidden].mean() < 0.05
     assert again[floor.truth[:, 0] > 225].mean() > 0.8
+
+
+def test_what_could_as_well_be_a_pixel_aside_is_not_found():
+    """Along stripes a patch stays wherever the search began: such places only echo the pose."""
+    floor = Floor()
+    stripes = [cv2.blur(view_from(T, k).gray, (25, 1)) for k, T in enumerate((np.eye(4), CLOSER))]
+    there = replace(view_from(np.eye(4)), gray=stripes[0])
+    noise = np.random.default_rng(5).normal(scale=2.0, size=stripes[1].shape)
+    gray = np.clip(stripes[1] + noise, 0, 255).astype(np.uint8)
+    floor.map.keep_patches(cut(there, floor.uv, floor.depth, ids=floor.ids))
+    found = floor.search(replace(floor.view, gray=gray))
+    assert len(found.visible_ids) > 100
+    assert len(found.tracks) < 0.1 * len(found.visible_ids)
+
+
+def test_leeway_tells_how_far_a_place_may_be_off():
+    rng = np.random.default_rng(6)
+    texture = cv2.GaussianBlur(rng.normal(size=(400, 400)), (0, 0), 2.5)
+    base = 128 + 20 * texture / texture.std()
+    places = rng.uniform(30, 370, (400, 2))
+    patch = map_search._windows(base.astype(np.float32), places)
+    brighter = map_search._windows((0.6 * base + 50).astype(np.float32), places)
+    assert map_search._leeway_px(patch, brighter).max() < 0.02
+    assert np.median(map_search._leeway_px(patch, 255 - patch)) > 2.0  # a negative is not alike
+    medians = []
+    for level in (2.0, 6.0):
+        noisy = np.clip(base + level * rng.normal(size=base.shape), 0, 255).astype(np.uint8)
+        gray = np.clip(base, 0, 255).astype(np.uint8)
+        start = places + rng.normal(scale=0.5, size=places.shape)
+        placed, _ = align_patches(gray, noisy, places, start, 3.0, np.ones(len(places), bool))
+        leeway = map_search._leeway_px(patch, map_search._windows(noisy, placed))
+        error = np.linalg.norm(placed - places, axis=1)
+        loose = leeway > np.median(leeway)
+        assert np.median(error[~loose]) < np.median(error[loose]) < 0.5 * np.median(leeway)
+        medians.append(np.median(leeway))
+    assert 2.0 < medians[1] / medians[0] < 4.0  # three times the noise
 
 
 def test_what_came_to_sight_lately_is_not_looked_for_by_its_looks():
