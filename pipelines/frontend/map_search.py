@@ -30,7 +30,7 @@ _NEAR_PX = 3.0  # alignment may move a place this far
 _RECENT = 10  # keyframes; what came to sight in these was lost for a reason
 _MOST = 600  # points that are looked for by their looks, those found most often first
 _HALF = 8  # of the window that is compared
-_MAX_LEEWAY_PX = 1.0  # of what is found; errors are about a third of it
+_MAX_LEEWAY_PX = 1.4  # of what is found; errors are about a third of it
 _OFFSETS = np.arange(-_HALF, _HALF + 1, dtype=np.float32)
 
 
