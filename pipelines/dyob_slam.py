@@ -49,14 +49,7 @@ from pipelines.objects.tracking import ObjectTracker
 from pipelines.observations import Tracks
 from pipelines.paged_arrays import PagedArrays
 from pipelines.perception import FILES, DenseFlow, Segmentation
-from pipelines.types import (
-    Array,
-    Frame,
-    FrameResult,
-    StaticMap,
-    StereoCamera,
-    TrackingStatus,
-)
+from pipelines.types import Array, Frame, FrameResult, StaticMap, StereoCamera, TrackingStatus
 
 _LANDMARK_MARGIN = 0.2  # features and pixels lie off objects in shares that differ by less
 _log = logging.getLogger("dyob.slam")

@@ -126,8 +126,12 @@ def _align_to_looks(
         own = use[part]
         sure = np.ones(len(own), bool)
         placed, found = align_patches(sheet, view.gray, places, start[own], _NEAR_PX, sure)
-        found &= _leeway_px(_windows(sheet, places), _windows(view.gray, placed)) < _MAX_LEEWAY_PX
-        uv[own[found]], alike[own[found]] = placed[found], True
+        good = np.flatnonzero(found)
+        if len(good) == 0:
+            continue
+        patch, there = _windows(sheet, places[found]), _windows(view.gray, placed[found])
+        good = good[_leeway_px(patch, there) < _MAX_LEEWAY_PX]
+        uv[own[good]], alike[own[good]] = placed[good], True
     return uv, alike
 
 

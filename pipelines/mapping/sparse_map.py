@@ -26,7 +26,8 @@ from pipelines.mapping.patch_album import PatchAlbum
 from pipelines.observations import StereoObservations, Tracks
 from pipelines.paged_arrays import PagedArrays
 from pipelines.patches import Patches
-from pipelines.types import Array, StaticMap, StereoCamera, check_shape
+from pipelines.shapes import check_ids, check_shape
+from pipelines.types import Array, StaticMap, StereoCamera
 
 Ids = NDArray[np.int64]
 
@@ -106,12 +107,13 @@ class SparseMap:
             column: NDArray = np.zeros((max(size, _FIRST_CAPACITY), *shape), dtype)
             column[:size] = columns[name]
             setattr(sparse_map, name, column)
-        _check_ids("first_keyframe", sparse_map.first_keyframe[:size], (-1, len(keyframes)))
+        first = sparse_map.first_keyframe[:size]
+        check_ids("SparseMap", "first_keyframe", first, (-1, len(keyframes)))
         for keyframe in keyframes:
-            _check_ids("point_ids", keyframe.tracks.point_ids, (0, size))
+            check_ids("SparseMap", "point_ids", keyframe.tracks.point_ids, (0, size))
         for others, n_shared in covisible:
             check_shape("SparseMap", "n_shared", n_shared, others.shape)
-            _check_ids("covisible", others, (0, len(keyframes)))
+            check_ids("SparseMap", "covisible", others, (0, len(keyframes)))
         if len(covisible) != len(keyframes):
             raise ValueError(f"SparseMap.covisible: {len(covisible)} of {len(keyframes)} keyframes")
         sparse_map._next_serial = int(columns["serial"].max(initial=-1)) + 1
@@ -395,14 +397,4 @@ class SparseMap:
             self._keyframe_Ts.copy(),
             np.array([k.frame_index for k in self.keyframes], np.int64),
             self.serial[ids].copy(),
-        )
-
-
-def _check_ids(name: str, ids: NDArray, limits: tuple[int, int]) -> None:
-    """Raise ValueError where an id lies outside [first, stop)."""
-    first, stop = limits
-    if len(ids) and not (first <= ids.min() and ids.max() < stop):
-        raise ValueError(
-            f"SparseMap.{name}: expected ids from {first} to {stop - 1}, "
-            f"found {ids.min()} to {ids.max()}"
         )
